@@ -1,0 +1,1 @@
+"""What the learned modules share: MPO, replay, weights, training runs, statistics."""

@@ -1,0 +1,1 @@
+"""The simulated world: levels, rules, solver, physics, rendering, Gymnasium environments, simulator node."""

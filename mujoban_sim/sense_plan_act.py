@@ -1,0 +1,99 @@
+"""One tick of the modular policy (paper Fig. 1b): sense, terminate, plan, act."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mujoban_sim.interfaces import (
+    NO_INSTRUCTION,
+    Controller,
+    ControllerInput,
+    Estimator,
+    EstimatorInput,
+    GroundTruth,
+    Memory,
+    Module,
+    Observation,
+    Planner,
+    PlannerState,
+    Termination,
+    TerminationInput,
+    TerminationOutput,
+    TerminationState,
+)
+
+
+class PolicyState(NamedTuple):
+    """States of the four modules and what they said in the last tick."""
+
+    estimator: Memory
+    termination: TerminationState
+    planner: PlannerState
+    controller: Memory
+    terminated: NDArray[np.bool_]
+    """beta_{t-1}, [B]."""
+
+
+class Decision(NamedTuple):
+    """What the modules said in one tick; one field per topic of the graph."""
+
+    abstract_state: NDArray[np.float32]
+    termination: TerminationOutput
+    instruction: NDArray[np.int64]
+    sequence: NDArray[np.int64]
+    issued: NDArray[np.bool_]
+    """Where A_t is a new instruction, [B]."""
+    torque: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class SensePlanAct:
+    """The four modules composed into one policy; the in-process twin of the ROS graph."""
+
+    estimator: Estimator
+    termination: Termination
+    planner: Planner
+    controller: Controller
+
+    def initial_state(self, seeds: NDArray[np.int64]) -> PolicyState:
+        """Return the state at the start of episodes with the given seeds, [B]."""
+        return PolicyState(
+            self.estimator.initial_state(seeds),
+            self.termination.initial_state(seeds),
+            self.planner.initial_state(seeds),
+            self.controller.initial_state(seeds),
+            np.zeros(len(seeds), np.bool_),
+        )
+
+    def step(self, obs: Observation, truth: GroundTruth, state: PolicyState) -> tuple[Decision, PolicyState]:
+        """Return the decision of tick t and the next state; `truth` reaches privileged modules only."""
+        estimate, estimator_state = self.estimator.step(
+            EstimatorInput(obs.frame, obs.pose, _truth_for(self.estimator, truth)), state.estimator
+        )
+        previous = np.where(state.planner.instruction < 0, NO_INSTRUCTION, state.planner.instruction)
+        beta, termination_state = self.termination.step(
+            TerminationInput(
+                obs.frame, obs.proprio, previous, state.terminated, _truth_for(self.termination, truth)
+            ),
+            state.termination,
+        )
+        instruction, planner_state = self.planner.step(estimate, beta.terminated, state.planner)
+        torque, controller_state = self.controller.step(
+            ControllerInput(
+                instruction, obs.frame, obs.proprio, beta.terminated, _truth_for(self.controller, truth)
+            ),
+            state.controller,
+        )
+        issued = planner_state.sequence != state.planner.sequence
+        decision = Decision(estimate, beta, instruction, planner_state.sequence, issued, torque)
+        return decision, PolicyState(
+            estimator_state, termination_state, planner_state, controller_state, beta.terminated
+        )
+
+
+def _truth_for(module: Module, truth: GroundTruth) -> GroundTruth | None:
+    return truth if module.privileged else None
