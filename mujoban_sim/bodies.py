@@ -1,0 +1,171 @@
+"""The robot's bodies: actuators, proprioception, scale and MJCF of each (paper appendix B, A.3).
+
+The world never assumes a particular body: it reads what it needs from a `Body`. The robot's generalised
+coordinates follow those of the boxes (see `mujoban_sim.scene`). A body's root is either
+
+- ``"slides"``: slide joints x, y, z, then a hinge about z whose angle is the heading, then the inner joints; or
+- ``"free"``: a free joint (position, quaternion), then the inner joints.
+
+In both cases the first two coordinates are the position in the frame ``map`` in metres, and z = 0 is the
+height at which the robot rests (``"slides"``) or the body's ``spawn_height`` (``"free"``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Literal
+
+from mujoban_sim.grid import TIME_LIMIT
+
+FIRST_PERSON_CAMERA: Final = "first_person"
+"""Name of the camera that every body carries; it yields o_cam."""
+ROBOT_BODY: Final = "robot"
+"""Name of the MJCF body that carries root joints, camera and sensors."""
+
+_SENSORS: Final = ("velocimeter", "gyro", "accelerometer")
+"""Inertial sensors in the order of proprioception; each has three values in the robot's frame."""
+INERTIAL_SIZE: Final = 3 * len(_SENSORS)
+UP_AXIS_SIZE: Final = 3
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """A motor: normalised torque in [-1, 1] times `gear` [N m] on a joint."""
+
+    joint: str
+    gear: float
+
+
+@dataclass(frozen=True)
+class Body:
+    """Everything that depends on the robot's body.
+
+    Proprioception o_pr has P = 12 + 2 J values, J inner joints in the order of `joints`:
+
+    ====================  ======  ==========================================================
+    slice                 length  meaning
+    ====================  ======  ==========================================================
+    ``[0:3]``             3       velocimeter: linear velocity in the robot's frame [m/s]
+    ``[3:6]``             3       gyro: angular velocity in the robot's frame [rad/s]
+    ``[6:9]``             3       accelerometer, gravity included, in the robot's frame [m/s^2]
+    ``[9:9+J]``           J       joint positions, hinges wrapped to [-pi, pi] [rad]
+    ``[9+J:9+2J]``        J       joint velocities [rad/s]
+    ``[9+2J:12+2J]``      3       the world's z-axis in the robot's frame
+    ====================  ======  ==========================================================
+
+    Attributes:
+        name: key in `BODIES`.
+        root: kind of root, see the module's docstring.
+        joints: names of the proprioceptive joints (hinges).
+        joint_qpos: their offsets among the robot's positions.
+        joint_qvel: their offsets among the robot's velocities.
+        actuators: motors in the order of the torque's U components.
+        qpos_size: number of the robot's positions.
+        qvel_size: number of the robot's velocities.
+        cell_size: edge of a cell in metres; the world is scaled by it, box mass and peg size are not (A.3).
+        time_limit: steps of an episode at 20 Hz (240 s for the ball, 480 s for the ant).
+        spawn_height: z of the root at rest.
+        radius: horizontal radius in metres within which the robot touches nothing else when it is placed.
+        mjcf: the ``<body>`` element, with the camera `FIRST_PERSON_CAMERA` and the site ``imu``.
+    """
+
+    name: str
+    root: Literal["slides", "free"]
+    joints: tuple[str, ...]
+    joint_qpos: tuple[int, ...]
+    joint_qvel: tuple[int, ...]
+    actuators: tuple[Actuator, ...]
+    qpos_size: int
+    qvel_size: int
+    cell_size: float
+    time_limit: int
+    spawn_height: float
+    radius: float
+    mjcf: str
+
+    @property
+    def action_size(self) -> int:
+        """U, the number of actuators."""
+        return len(self.actuators)
+
+    @property
+    def proprio_size(self) -> int:
+        """P, the number of proprioceptive values."""
+        return INERTIAL_SIZE + 2 * len(self.joints) + UP_AXIS_SIZE
+
+    @cached_property
+    def actuator_mjcf(self) -> str:
+        """The ``<actuator>`` section; controls are normalised torques in [-1, 1]."""
+        motors = "".join(
+            f'<motor name="{a.joint}" joint="{a.joint}" gear="{a.gear}" ctrllimited="true" ctrlrange="-1 1"/>'
+            for a in self.actuators
+        )
+        return f"<actuator>{motors}</actuator>"
+
+    @cached_property
+    def sensor_mjcf(self) -> str:
+        """The ``<sensor>`` section: the inertial sensors, in the order of proprioception."""
+        return "<sensor>" + "".join(f'<{kind} site="imu"/>' for kind in _SENSORS) + "</sensor>"
+
+
+# Two degrees of freedom: a steered head rolls on a ball, after the BoxHead walker of dm_control without its
+# arms and kick. Gears and damping are measured choices: top speed 2 m/s without wheel spin. Low torsional
+# friction, since a high one leaves a dead band of steering. The camera looks 6 degrees down from 0.85 m, which
+# sees over boxes. Ears show the heading from above: red on the right, blue on the left.
+_BALL_MJCF: Final = f"""
+<body name="{ROBOT_BODY}" pos="0 0 0.6">
+  <joint name="x" type="slide" axis="1 0 0"/>
+  <joint name="y" type="slide" axis="0 1 0"/>
+  <joint name="z" type="slide" axis="0 0 1"/>
+  <joint name="steer" type="hinge" axis="0 0 1" damping="4"/>
+  <inertial pos="0 0 -0.08" mass="20" diaginertia="0.11 0.11 0.147"/>
+  <site name="imu" pos="0 0 0" size="0.01" group="4"/>
+  <geom name="head" class="robot_visual" type="cylinder" size="0.1 0.06" pos="0 0 -0.07" rgba="0.3 0.3 0.3 1"/>
+  <geom name="ear_red" class="robot_visual" type="sphere" size="0.1" pos="0 -0.2 0" rgba="0.7 0 0 1"/>
+  <geom name="ear_blue" class="robot_visual" type="sphere" size="0.1" pos="0 0.2 0" rgba="0 0 0.7 1"/>
+  <camera name="{FIRST_PERSON_CAMERA}" pos="0.15 0 0.25" xyaxes="0 -1 0 0.104528 0 0.994522" fovy="80"/>
+  <body name="wheel" pos="0 0 -0.4">
+    <joint name="roll" type="hinge" axis="0 1 0" damping="2"/>
+    <geom name="ball" class="robot" type="sphere" size="0.2" mass="1" condim="4" friction="0.5 0.005 0.0001"
+          rgba="0.6 0.6 0.6 1"/>
+  </body>
+</body>
+"""
+
+ROBOT_DEFAULTS: Final = """
+<default class="robot"><geom contype="7" conaffinity="7"/></default>
+<default class="robot_visual"><geom contype="0" conaffinity="0" mass="0"/></default>
+"""
+"""MJCF defaults that every body's fragment relies on; contact bits as in `mujoban_sim.scene`."""
+
+BALL: Final = Body(
+    name="ball",
+    root="slides",
+    joints=("roll", "steer"),
+    joint_qpos=(4, 3),
+    joint_qvel=(4, 3),
+    actuators=(Actuator("roll", 20.0), Actuator("steer", 20.0)),
+    qpos_size=5,
+    qvel_size=5,
+    cell_size=1.0,
+    time_limit=TIME_LIMIT,
+    spawn_height=0.0,
+    radius=0.2,
+    mjcf=_BALL_MJCF,
+)
+
+BODIES: Final[dict[str, Body]] = {BALL.name: BALL}
+"""Registry of bodies; add one and every environment, node and trainer accepts its name."""
+
+
+def get_body(name: str) -> Body:
+    """Return the body of a given name.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    try:
+        return BODIES[name]
+    except KeyError:
+        raise ValueError(f"unknown body {name!r}: expected one of {', '.join(sorted(BODIES))}") from None
