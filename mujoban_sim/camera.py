@@ -1,0 +1,105 @@
+"""Pinhole geometry of the robot's camera, in NumPy: where a point of the map appears in a frame.
+
+The simulator's renderer and ``camera_info``, and the estimator's projective attention, all use these functions.
+
+Frames follow REP 103: ``map`` is x east, y north, z up; the optical frame of the camera is x right, y down,
+z forward. Pixels are (u, v) = (column, row) with row 0 at the top; integer values are pixel centres, so an image
+of `size` pixels spans -0.5 to size - 0.5.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FRAME_SIZE = 64
+"""Rows and columns of the frames that the modules see (paper appendix B)."""
+
+
+@dataclass(frozen=True)
+class CameraMount:
+    """How a body carries its first-person camera; it looks along the robot's heading."""
+
+    forward: float = 0.15
+    """Metres in front of the body's vertical axis."""
+    height: float = 0.85
+    """Metres above the floor when the robot stands upright."""
+    pitch: float = math.radians(6.0)
+    """Radians by which the optical axis points below the horizon."""
+    fovy: float = 80.0
+    """Vertical field of view in degrees (pixels are square)."""
+
+
+class Projection(NamedTuple):
+    """Where points appear in a frame."""
+
+    pixels: NDArray[np.float64]
+    """(u, v) in pixels, [..., 2]; meaningless where `depth` <= 0."""
+    depth: NDArray[np.float64]
+    """Distance along the optical axis in metres, [...]; negative behind the camera."""
+
+
+def camera_intrinsics(mount: CameraMount, size: int = FRAME_SIZE) -> NDArray[np.float64]:
+    """Return the intrinsic matrix K of a square frame of `size` pixels, [3, 3] (``CameraInfo.k``)."""
+    focal = 0.5 * size / math.tan(0.5 * math.radians(mount.fovy))
+    centre = 0.5 * (size - 1)
+    return np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
+
+
+def camera_extrinsics(mount: CameraMount, pose: ArrayLike) -> NDArray[np.float64]:
+    """Return the transforms that take homogeneous map points to the optical frame, [..., 4, 4].
+
+    Args:
+        mount: the body's camera.
+        pose: robot pose (x [m], y [m], psi [rad]) in the map frame, [..., 3].
+    """
+    p = np.asarray(pose, dtype=np.float64)
+    cos, sin = np.cos(p[..., 2]), np.sin(p[..., 2])
+    cp, sp = math.cos(mount.pitch), math.sin(mount.pitch)
+    zero, one = np.zeros_like(cos), np.ones_like(cos)
+    # Rows: image right, image down, optical axis, each as a unit vector of the map frame.
+    rotation = np.stack(
+        [
+            np.stack([sin, -cos, zero], axis=-1),
+            np.stack([-sp * cos, -sp * sin, -cp * one], axis=-1),
+            np.stack([cp * cos, cp * sin, -sp * one], axis=-1),
+        ],
+        axis=-2,
+    )
+    eye = np.stack(
+        [p[..., 0] + mount.forward * cos, p[..., 1] + mount.forward * sin, mount.height * one], axis=-1
+    )
+    transform = np.zeros((*p.shape[:-1], 4, 4))
+    transform[..., :3, :3] = rotation
+    transform[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, eye)
+    transform[..., 3, 3] = 1.0
+    return transform
+
+
+def project(points: ArrayLike, pose: ArrayLike, mount: CameraMount, size: int = FRAME_SIZE) -> Projection:
+    """Return where points of the map appear in the frames of robots.
+
+    Args:
+        points: (x, y, z) in the map frame in metres, [..., N, 3]; leading axes broadcast with those of `pose`.
+        pose: robot pose (x [m], y [m], psi [rad]) in the map frame, [..., 3].
+        mount: the body's camera.
+        size: rows and columns of the frame.
+
+    Returns:
+        Pixels [..., N, 2] and depth [..., N].
+    """
+    transform = camera_extrinsics(mount, pose)
+    intrinsics = camera_intrinsics(mount, size)
+    # Shape [..., N, 3], optical frame.
+    optical = (
+        np.asarray(points, dtype=np.float64) @ np.swapaxes(transform[..., :3, :3], -1, -2)
+        + transform[..., None, :3, 3]
+    )
+    depth = optical[..., 2]
+    safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+    pixels = optical[..., :2] / safe[..., None] * intrinsics[[0, 1], [0, 1]] + intrinsics[:2, 2]
+    return Projection(pixels, depth)
