@@ -12,10 +12,12 @@ height at which the robot rests (``"slides"``) or the body's ``spawn_height`` (`
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal
 
+from mujoban_sim.camera import CameraMount
 from mujoban_sim.grid import TIME_LIMIT
 
 FIRST_PERSON_CAMERA: Final = "first_person"
@@ -67,6 +69,7 @@ class Body:
         time_limit: steps of an episode at 20 Hz (240 s for the ball, 480 s for the ant).
         spawn_height: z of the root at rest.
         radius: horizontal radius in metres within which the robot touches nothing else when it is placed.
+        camera: how the body carries its first-person camera.
         mjcf: the ``<body>`` element, with the camera `FIRST_PERSON_CAMERA` and the site ``imu``.
     """
 
@@ -82,6 +85,7 @@ class Body:
     time_limit: int
     spawn_height: float
     radius: float
+    camera: CameraMount
     mjcf: str
 
     @property
@@ -113,8 +117,10 @@ class Body:
 # arms and kick. Gears and damping are measured choices: top speed 2 m/s without wheel spin. Low torsional
 # friction, since a high one leaves a dead band of steering. The camera looks 6 degrees down from 0.85 m, which
 # sees over boxes. Ears show the heading from above: red on the right, blue on the left.
+_BALL_HEIGHT: Final = 0.6
+_BALL_CAMERA: Final = CameraMount(forward=0.15, height=0.85, pitch=math.radians(6.0), fovy=80.0)
 _BALL_MJCF: Final = f"""
-<body name="{ROBOT_BODY}" pos="0 0 0.6">
+<body name="{ROBOT_BODY}" pos="0 0 {_BALL_HEIGHT}">
   <joint name="x" type="slide" axis="1 0 0"/>
   <joint name="y" type="slide" axis="0 1 0"/>
   <joint name="z" type="slide" axis="0 0 1"/>
@@ -124,7 +130,7 @@ _BALL_MJCF: Final = f"""
   <geom name="head" class="robot_visual" type="cylinder" size="0.1 0.06" pos="0 0 -0.07" rgba="0.3 0.3 0.3 1"/>
   <geom name="ear_red" class="robot_visual" type="sphere" size="0.1" pos="0 -0.2 0" rgba="0.7 0 0 1"/>
   <geom name="ear_blue" class="robot_visual" type="sphere" size="0.1" pos="0 0.2 0" rgba="0 0 0.7 1"/>
-  <camera name="{FIRST_PERSON_CAMERA}" pos="0.15 0 0.25" xyaxes="0 -1 0 0.104528 0 0.994522" fovy="80"/>
+  {_BALL_CAMERA.mjcf(FIRST_PERSON_CAMERA, origin_height=_BALL_HEIGHT)}
   <body name="wheel" pos="0 0 -0.4">
     <joint name="roll" type="hinge" axis="0 1 0" damping="2"/>
     <geom name="ball" class="robot" type="sphere" size="0.2" mass="1" condim="4" friction="0.5 0.005 0.0001"
@@ -152,6 +158,7 @@ BALL: Final = Body(
     time_limit=TIME_LIMIT,
     spawn_height=0.0,
     radius=0.2,
+    camera=_BALL_CAMERA,
     mjcf=_BALL_MJCF,
 )
 

@@ -24,14 +24,20 @@ FRAME_SIZE = 64
 class CameraMount:
     """How a body carries its first-person camera; it looks along the robot's heading."""
 
-    forward: float = 0.15
+    forward: float
     """Metres in front of the body's vertical axis."""
-    height: float = 0.85
+    height: float
     """Metres above the floor when the robot stands upright."""
-    pitch: float = math.radians(6.0)
+    pitch: float
     """Radians by which the optical axis points below the horizon."""
-    fovy: float = 80.0
+    fovy: float
     """Vertical field of view in degrees (pixels are square)."""
+
+    def mjcf(self, name: str, origin_height: float) -> str:
+        """Return the ``<camera>`` element for a body whose origin is `origin_height` metres above the floor."""
+        up = f"{math.sin(self.pitch)} 0 {math.cos(self.pitch)}"
+        position = f"{self.forward} 0 {self.height - origin_height}"
+        return f'<camera name="{name}" pos="{position}" xyaxes="0 -1 0 {up}" fovy="{self.fovy}"/>'
 
 
 class Projection(NamedTuple):
@@ -70,9 +76,7 @@ def camera_extrinsics(mount: CameraMount, pose: ArrayLike) -> NDArray[np.float64
         ],
         axis=-2,
     )
-    eye = np.stack(
-        [p[..., 0] + mount.forward * cos, p[..., 1] + mount.forward * sin, mount.height * one], axis=-1
-    )
+    eye = np.stack([p[..., 0] + mount.forward * cos, p[..., 1] + mount.forward * sin, mount.height * one], axis=-1)
     transform = np.zeros((*p.shape[:-1], 4, 4))
     transform[..., :3, :3] = rotation
     transform[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, eye)
@@ -96,8 +100,7 @@ def project(points: ArrayLike, pose: ArrayLike, mount: CameraMount, size: int = 
     intrinsics = camera_intrinsics(mount, size)
     # Shape [..., N, 3], optical frame.
     optical = (
-        np.asarray(points, dtype=np.float64) @ np.swapaxes(transform[..., :3, :3], -1, -2)
-        + transform[..., None, :3, 3]
+        np.asarray(points, dtype=np.float64) @ np.swapaxes(transform[..., :3, :3], -1, -2) + transform[..., None, :3, 3]
     )
     depth = optical[..., 2]
     safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
