@@ -1,0 +1,164 @@
+"""Weights that ship: safetensors with a JSON record beside, both checked when they are loaded."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as dump_tensors
+from torch import Tensor, nn
+
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+
+class WeightsError(ValueError):
+    """A weights file or its record is missing, damaged, or does not fit the module."""
+
+
+def digest(path: str | Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file such that a crash leaves either the old or the new content."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    with temporary.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def record_path(path: str | Path) -> Path:
+    """Return where the record of a weights file stands."""
+    return Path(path).with_suffix(".json")
+
+
+def provenance() -> dict[str, Any]:
+    """Return the command line and commit that weights come from, for their record."""
+    command = [Path(sys.argv[0]).name, *sys.argv[1:]]
+    main = sys.modules.get("__main__")
+    spec = getattr(main, "__spec__", None)
+    if spec is not None and spec.name:
+        command = ["python", "-m", spec.name.removesuffix(".__main__"), *sys.argv[1:]]
+    try:
+        commit = subprocess.run(
+            ["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10
+        ).stdout.strip()
+    except OSError:
+        commit = ""
+    return {"command": " ".join(command), "commit": commit or None, "torch": torch.__version__}
+
+
+def save_weights(
+    path: str | Path, module: nn.Module, config: Any, record: Mapping[str, Any]
+) -> None:
+    """Write a module's weights and their record (`<name>.safetensors`, `<name>.json`).
+
+    Args:
+        path: File to write; must end in `.safetensors`.
+        module: Module whose `state_dict` is written, as contiguous CPU tensors.
+        config: Keyword arguments that rebuild the module: a mapping or a dataclass, JSON-serialisable.
+        record: What else the record says (command, data, commit, steps, metrics; see `provenance`).
+
+    Raises:
+        WeightsError: If a weight is not finite or the name does not end in `.safetensors`.
+    """
+    path = Path(path)
+    if path.suffix != ".safetensors":
+        raise WeightsError(f"expected a file name that ends in .safetensors, got {path}")
+    fields = dataclasses.asdict(config) if dataclasses.is_dataclass(config) else dict(config)  # type: ignore[arg-type]
+    tensors = {k: v.detach().cpu().contiguous().clone() for k, v in module.state_dict().items()}
+    check_finite(tensors, str(path))
+    data = dump_tensors(tensors, {"class": type(module).__name__})
+    content = {
+        "class": type(module).__name__,
+        "config": fields,
+        "parameters": sum(p.numel() for p in module.parameters()),
+        "digest": hashlib.sha256(data).hexdigest(),
+        **record,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    write_atomically(path, data)
+    write_atomically(record_path(path), text.encode())
+
+
+def read_record(path: str | Path) -> dict[str, Any]:
+    """Return the record beside a weights file.
+
+    Raises:
+        WeightsError: If it is missing or is not a record.
+    """
+    file = record_path(path)
+    try:
+        content = json.loads(file.read_text())
+    except FileNotFoundError:
+        raise WeightsError(f"{file}: no record beside the weights; expected a JSON file") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise WeightsError(f"{file}: not a JSON record: {error}") from None
+    if not isinstance(content, dict) or not {"class", "config", "digest"} <= content.keys():
+        raise WeightsError(f"{file}: expected a JSON object with keys class, config and digest")
+    return content
+
+
+def load_weights(cls: type[ModuleT], path: str | Path, device: str | torch.device = "cpu") -> ModuleT:
+    """Build `cls(**config)` from a record and load its weights, in evaluation mode.
+
+    Args:
+        cls: Class of the module; its name must be the one in the record.
+        path: The `.safetensors` file; its record stands beside it.
+        device: Where the module is put.
+
+    Raises:
+        WeightsError: If a file is missing or damaged (digest), or class, configuration or shapes do not fit.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such weights file; expected .safetensors written by a train command")
+    record = read_record(path)
+    data = path.read_bytes()
+    if (found := hashlib.sha256(data).hexdigest()) != record["digest"]:
+        raise WeightsError(f"{path}: damaged or not the file of its record: SHA-256 is {found}, not {record['digest']}")
+    if record["class"] != cls.__name__:
+        raise WeightsError(f"{path}: holds weights of {record['class']}, expected {cls.__name__}")
+    try:
+        module = cls(**record["config"])
+    except (TypeError, ValueError) as error:
+        raise WeightsError(f"{path}: configuration does not fit {cls.__name__}: {error}") from None
+    try:
+        tensors = load_tensors(data)
+    except SafetensorError as error:
+        raise WeightsError(f"{path}: not a safetensors file: {error}") from None
+    _check_shapes(tensors, module.state_dict(), path)
+    check_finite(tensors, str(path))
+    module.load_state_dict(tensors)
+    return module.to(device).eval()
+
+
+def check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
+    """Raise `WeightsError` naming the first tensor that holds a NaN or an infinity."""
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            raise WeightsError(f"{where}: {name} is not finite")
+
+
+def _check_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], path: Path) -> None:
+    missing, extra = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
+    if missing or extra:
+        raise WeightsError(f"{path}: missing weights {missing[:4]}, unexpected weights {extra[:4]}")
+    for name, tensor in expected.items():
+        if tensor.shape != tensors[name].shape:
+            got, want = tuple(tensors[name].shape), tuple(tensor.shape)
+            raise WeightsError(f"{path}: {name} has shape {got}, expected {want}")

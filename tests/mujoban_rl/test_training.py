@@ -1,0 +1,138 @@
+import json
+import os
+import signal
+
+import pytest
+import torch
+from torch import nn
+
+from mujoban_rl.stats import wilson_interval
+from mujoban_rl.training import NaNGuard, RunDirectory, RunError, StopSignal, TimeLimit, TrainingLog
+from mujoban_rl.weights import WeightsError, load_weights, record_path, save_weights
+
+
+class Net(nn.Module):
+    def __init__(self, width: int = 4) -> None:
+        super().__init__()
+        self.layer = nn.Linear(width, 2)
+
+
+def _fit(net, adam, steps):
+    for i in range(steps):
+        adam.zero_grad()
+        net.layer(torch.full((3, 4), float(i % 3))).square().sum().backward()
+        adam.step()
+
+
+def _make():
+    torch.manual_seed(0)
+    net = Net()
+    return net, torch.optim.AdamW(net.parameters(), 1e-2)
+
+
+def test_resumed_training_equals_uninterrupted_training(tmp_path):
+    net, adam = _make()
+    _fit(net, adam, 3)
+    RunDirectory(tmp_path, {"lr": 1}).save(3, modules={"net": net}, optimisers={"adam": adam}, extra={"k": [1]})
+    again, adam2 = _make()
+    snapshot = RunDirectory(tmp_path, {"lr": 1}).load(modules={"net": again}, optimisers={"adam": adam2})
+    assert snapshot is not None and (snapshot.step, snapshot.extra) == (3, {"k": [1]})
+    _fit(net, adam, 3)
+    _fit(again, adam2, 3)
+    assert torch.equal(net.layer.weight, again.layer.weight)
+
+
+def test_damaged_newest_checkpoint_falls_back_to_the_one_before(tmp_path):
+    net, _adam = _make()
+    run = RunDirectory(tmp_path, {})
+    run.save(1, modules={"net": net})
+    run.save(2, modules={"net": net}).write_bytes(b"broken")
+    snapshot = run.load(modules={"net": Net()})
+    assert snapshot is not None and snapshot.step == 1
+    (tmp_path / "checkpoint-0000000001.json").unlink()
+    with pytest.raises(RunError, match="none of 2 checkpoints"):
+        run.load(modules={"net": Net()})
+
+
+def test_only_the_last_checkpoints_are_kept_and_nan_is_never_written(tmp_path):
+    net, _ = _make()
+    run = RunDirectory(tmp_path, {}, keep=2)
+    for step in range(4):
+        run.save(step, modules={"net": net})
+    assert sorted(p.name for p in tmp_path.glob("*.safetensors")) == [
+        f"checkpoint-{i:010d}.safetensors" for i in (2, 3)
+    ]
+    net.layer.bias.data[0] = float("nan")
+    with pytest.raises(WeightsError, match=r"layer\.bias"):
+        run.save(4, modules={"net": net})
+    assert not (tmp_path / "checkpoint-0000000004.safetensors").exists()
+
+
+def test_run_directory_refuses_another_configuration(tmp_path):
+    RunDirectory(tmp_path, {"lr": 1})
+    with pytest.raises(RunError, match="lr: 1 there, 2 now"):
+        RunDirectory(tmp_path, {"lr": 2})
+
+
+def test_weights_round_trip_and_name_what_is_wrong(tmp_path):
+    net, _ = _make()
+    path = tmp_path / "net.safetensors"
+    save_weights(path, net, {"width": 4}, {"steps": 7})
+    assert torch.equal(load_weights(Net, path).layer.weight, net.layer.weight)
+    record = json.loads(record_path(path).read_text())
+    assert record["steps"] == 7
+
+    record_path(path).write_text(json.dumps(record | {"config": {"width": 5}}))
+    with pytest.raises(WeightsError, match=r"layer\.weight has shape \(2, 4\), expected \(2, 5\)"):
+        load_weights(Net, path)
+    record_path(path).write_text(json.dumps(record | {"config": {"depth": 5}}))
+    with pytest.raises(WeightsError, match="configuration does not fit Net"):
+        load_weights(Net, path)
+    record_path(path).write_text(json.dumps(record | {"class": "Other"}))
+    with pytest.raises(WeightsError, match="holds weights of Other"):
+        load_weights(Net, path)
+    record_path(path).write_text(json.dumps(record))
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    with pytest.raises(WeightsError, match="damaged"):
+        load_weights(Net, path)
+    with pytest.raises(WeightsError, match="no such weights file"):
+        load_weights(Net, tmp_path / "none.safetensors")
+
+
+def test_nan_guard_refuses_and_gives_up():
+    guard = NaNGuard(patience=2)
+    assert guard.accept(torch.tensor(1.0), 2.0)
+    assert not guard.accept(torch.tensor(float("nan")))
+    assert not guard.accept(float("inf"))
+    with pytest.raises(FloatingPointError):
+        guard.accept(float("nan"))
+
+
+def test_termination_signal_asks_the_loop_to_end():
+    before = signal.getsignal(signal.SIGTERM)
+    with StopSignal() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.requested
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert TimeLimit(0.0).reached and not TimeLimit(None).reached
+
+
+def test_log_keeps_a_readable_learning_curve(tmp_path):
+    run = RunDirectory(tmp_path, {})
+    with TrainingLog(run, total=2) as log:
+        log.scalars(1, {"loss": torch.tensor(0.5), "bad": float("nan")})
+    line = json.loads((tmp_path / "metrics.jsonl").read_text())
+    assert (line["step"], line["loss"], line["bad"]) == (1, 0.5, None)
+
+
+@pytest.mark.parametrize(("successes", "n"), [(0, 0), (0, 20), (20, 20), (950, 1000)])
+def test_wilson_interval_holds_the_rate(successes, n):
+    low, high = wilson_interval(successes, n)
+    assert 0.0 <= low <= (successes / n if n else 0.0) <= high <= 1.0
+
+
+def test_wilson_interval_matches_the_published_formula_and_rejects_nonsense():
+    # 81/263, 95 %: Newcombe 1998, table I, method 3
+    assert wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    with pytest.raises(ValueError, match="successes"):
+        wilson_interval(3, 2)
