@@ -1,0 +1,69 @@
+"""Markdown tables of evaluations beside the paper's values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.paper.runs import Run, load
+from mujoban_rl.weights import digest
+from mujoban_sim.plugins import ROLES, shipped_weights
+
+STALE = " †"
+"""Marks a result of other weights than those that ship now."""
+MISSING = "-"
+
+
+def configurations(runs: Sequence[Run]) -> str:
+    """Return a table of success rates and rewards, ours beside the paper's."""
+    header = ["configuration", "oracles", "n", "success", "95 % interval", "paper", "reward (s.e.)", "paper"]
+    return _table(header, [_row(run, load(run)) for run in runs])
+
+
+def failures(runs: Sequence[Run]) -> str:
+    """Return a table of how many episodes failed for which reason."""
+    reports = [load(run) for run in runs]
+    reasons = sorted({reason for report in reports if report for reason in report["failures"]})
+    rows = [
+        [run.title, *(str(report["failures"].get(reason, 0)) for reason in reasons)]
+        for run, report in zip(runs, reports, strict=True)
+        if report
+    ]
+    return _table(["configuration", *reasons], rows)
+
+
+def is_stale(report: dict[str, Any]) -> bool:
+    """Tell whether a module of the evaluation had other weights than those that ship now."""
+    return any(
+        len(identity) == 64 and identity != digest(shipped_weights(role))
+        for role, identity in report["weights"].items()
+        if role in ROLES
+    )
+
+
+def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
+    oracles = ", ".join(run.oracle) or "none"
+    paper = [MISSING if run.paper_success is None else f"{100 * run.paper_success:.1f} %"]
+    paper.append(MISSING if run.paper_reward is None else f"{run.paper_reward:.2f}")
+    if report is None:
+        return [run.title, oracles, "0", "not measured", MISSING, paper[0], MISSING, paper[1]]
+    returns = np.array([episode["return"] for episode in report["episodes"]])
+    error = returns.std(ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else float("nan")
+    low, high = report["success_interval"]
+    return [
+        run.title + (STALE if is_stale(report) else ""),
+        oracles,
+        str(len(returns)),
+        f"{100 * report['success_rate']:.1f} %",
+        f"{100 * low:.1f} to {100 * high:.1f} %",
+        paper[0],
+        f"{report['mean_return']:.2f} ({error:.2f})",
+        paper[1],
+    ]
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
