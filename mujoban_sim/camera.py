@@ -106,3 +106,26 @@ def project(points: ArrayLike, pose: ArrayLike, mount: CameraMount, size: int = 
     safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
     pixels = optical[..., :2] / safe[..., None] * intrinsics[[0, 1], [0, 1]] + intrinsics[:2, 2]
     return Projection(pixels, depth)
+
+
+def in_view(points: ArrayLike, radius: ArrayLike, pose: ArrayLike, mount: CameraMount) -> NDArray[np.bool_]:
+    """Return whether spheres may be seen by the cameras of robots, occlusion aside.
+
+    Args:
+        points: centres (x, y, z) in the map frame in metres, [..., N, 3].
+        radius: in metres, broadcast to [..., N].
+        pose: robot pose (x [m], y [m], psi [rad]) in the map frame, [..., 3].
+        mount: the body's camera.
+
+    Returns:
+        [..., N]; false only if no part of the sphere is in the frame.
+    """
+    transform = camera_extrinsics(mount, pose)
+    optical = (
+        np.asarray(points, dtype=np.float64) @ np.swapaxes(transform[..., :3, :3], -1, -2) + transform[..., None, :3, 3]
+    )
+    half = math.radians(mount.fovy) / 2
+    reach = np.asarray(radius, dtype=np.float64)
+    # A sphere is outside if it lies beyond one of the frame's side planes, or behind.
+    bound = optical[..., 2] * math.tan(half) + reach / math.cos(half)
+    return (optical[..., 2] > -reach) & (np.abs(optical[..., :2]).max(axis=-1) < bound)
