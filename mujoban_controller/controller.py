@@ -1,0 +1,241 @@
+"""The controller: camera, proprioception, instruction and termination signal to torques (paper C.3).
+
+A ResNet reads the frame; its features, proprioception, A and beta go into an LSTM; a fully connected head gives
+the mean and scale of a normal distribution over torques.
+
+Proprioception holds joint positions, so the network is given sine and cosine of each hinge, as they are and
+turned into the frame of the instruction (instructed direction = +x). For the ball, whose steer joint is the
+heading, this says at once by how much to turn.
+
+Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators, F features, H memory units.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mujoban_sim.bodies import INERTIAL_SIZE, get_body
+from mujoban_sim.camera import FRAME_SIZE
+from mujoban_sim.grid import OFFSETS_XY, Instruction
+from mujoban_sim.interfaces import Controller, ControllerInput, Memory
+
+MIN_SCALE = 1e-3
+"""Smallest standard deviation of a torque."""
+INITIAL_SCALE = 0.5
+"""Standard deviation of every torque before training."""
+_CLIP = 5.0
+
+
+class Gaussian(NamedTuple):
+    """A diagonal normal distribution over torques."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+        """Return one draw, not limited to [-1, 1]."""
+        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
+        return self.mean + self.scale * noise
+
+
+class ControllerOutput(NamedTuple):
+    """Result of `VisuomotorController.forward`."""
+
+    action: Gaussian
+    """Distribution over torques; mean and scale [B, T, U]."""
+    features: Tensor
+    """What the action rests on, [B, T, H + F]; auxiliary losses attach here."""
+    memory: tuple[Tensor, Tensor]
+    """LSTM output and cell after the last tick, [B, H] each."""
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions beside a strided 1x1 one (He et al. 2016), without normalisation."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(inputs, outputs, 3, stride, 1)
+        self.second = nn.Conv2d(outputs, outputs, 3, 1, 1)
+        self.shortcut = nn.Conv2d(inputs, outputs, 1, stride)
+        with torch.no_grad():
+            self.second.weight.mul_(0.5)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, C, H, W] to [B, C', H / stride, W / stride]."""
+        return F.relu(self.shortcut(x) + self.second(F.relu(self.first(x))))
+
+
+def frame_encoder(channels: Sequence[int], features: int) -> nn.Sequential:
+    """Return the ResNet from frames [B, 3, 64, 64] to features [B, F]; the last block keeps its resolution."""
+    stem, *widths = channels
+    layers: list[nn.Module] = [nn.Conv2d(3, stem, 4, 2, 1), nn.ReLU()]
+    size, width = FRAME_SIZE // 2, stem
+    for i, outputs in enumerate(widths):
+        stride = 1 if i == len(widths) - 1 else 2
+        layers.append(ResidualBlock(width, outputs, stride))
+        size, width = size // stride, outputs
+    layers += [nn.Flatten(), nn.Linear(width * size * size, features), nn.LayerNorm(features), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+class VisuomotorController(nn.Module, Controller):
+    """The learned controller of paper C.3; sees o_cam, o_pr, A and beta and nothing else.
+
+    As a `Controller` it is deterministic: the mean torque, limited to [-1, 1].
+    """
+
+    proprio_mean: Tensor
+    proprio_scale: Tensor
+    direction: Tensor
+
+    def __init__(
+        self,
+        body: str = "ball",
+        channels: Sequence[int] = (24, 32, 48, 64),
+        features: int = 256,
+        hidden: int = 192,
+    ) -> None:
+        """Build the network for a body.
+
+        Args:
+            body: Key in `mujoban_sim.bodies.BODIES`; fixes P and U.
+            channels: Width of the stem and of each residual block.
+            features: F, width of the fully connected layers.
+            hidden: H, width of the LSTM.
+
+        Raises:
+            ValueError: If the body is unknown or there are fewer than two widths.
+        """
+        super().__init__()
+        if len(channels) < 2:
+            raise ValueError(f"channels {tuple(channels)}: expected the stem's width and one for each residual block")
+        layout = get_body(body)
+        self.config = {"body": body, "channels": list(channels), "features": features, "hidden": hidden}
+        self.body = body
+        self.joints = len(layout.joints)
+        self.proprio_size, self.action_size, self.hidden = layout.proprio_size, layout.action_size, hidden
+        # Joint positions are replaced by two sine-cosine pairs; A is one-hot, beta one bit.
+        inputs = self.proprio_size + 3 * self.joints + len(Instruction) + 1
+        self.encoder = frame_encoder(channels, features)
+        self.body_encoder = nn.Sequential(nn.Linear(inputs, features), nn.LayerNorm(features), nn.ReLU())
+        self.mix = nn.Sequential(nn.Linear(2 * features, features), nn.ReLU())
+        self.lstm = nn.LSTMCell(features, hidden)
+        self.trunk = nn.Sequential(nn.Linear(hidden + features, features), nn.ReLU())
+        self.mean = nn.Linear(features, self.action_size)
+        self.scale = nn.Linear(features, self.action_size)
+        self.register_buffer("proprio_mean", torch.zeros(self.proprio_size))
+        self.register_buffer("proprio_scale", torch.ones(self.proprio_size))
+        # Shape [5, 2]: the instructed direction in the map; stay counts as east.
+        direction = np.where(OFFSETS_XY.any(1, keepdims=True), OFFSETS_XY, (1.0, 0.0))
+        self.register_buffer("direction", torch.tensor(direction, dtype=torch.float32), persistent=False)
+        self._initialise()
+        self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    def _initialise(self) -> None:
+        for head in (self.mean, self.scale):
+            nn.init.uniform_(head.weight, -1e-3, 1e-3)
+            nn.init.zeros_(head.bias)
+
+    def fit_normalisation(self, proprio: Tensor) -> None:
+        """Take mean and deviation of proprioceptive samples, [M, P], for the normalisation of inputs."""
+        self.proprio_mean.copy_(proprio.mean(0))
+        self.proprio_scale.copy_(proprio.std(0).clamp(min=1e-2))
+
+    def encode(self, frame: Tensor) -> Tensor:
+        """Return the ResNet's features [M, F] of frames uint8 [M, 64, 64, 3]."""
+        # A permuted NHWC tensor is channels_last already.
+        x = frame.permute(0, 3, 1, 2).to(self.mean.weight.dtype) / 255.0 - 0.5
+        return self.encoder(x)
+
+    def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor) -> Tensor:
+        """Return the encoding of all other inputs, [M, F].
+
+        Args:
+            proprio: o_pr, [M, P].
+            instruction: A, int64 [M].
+            terminated: beta, bool [M].
+        """
+        j = self.joints
+        angle = proprio[:, INERTIAL_SIZE : INERTIAL_SIZE + j]
+        normal = ((proprio - self.proprio_mean) / self.proprio_scale).clamp(-_CLIP, _CLIP)
+        rest = torch.cat([normal[:, :INERTIAL_SIZE], normal[:, INERTIAL_SIZE + j :]], -1)
+        cos, sin = angle.cos(), angle.sin()
+        # Shape [M, 1] each.
+        along, left = self.direction[instruction].unbind(-1)
+        along, left = along[:, None], left[:, None]
+        turned = (cos * along + sin * left, sin * along - cos * left)
+        symbol = F.one_hot(instruction, len(Instruction)).to(proprio.dtype)
+        beta = terminated.to(proprio.dtype)[:, None]
+        return self.body_encoder(torch.cat([rest, cos, sin, *turned, symbol, beta], -1))
+
+    def forward(
+        self,
+        frame: Tensor,
+        proprio: Tensor,
+        instruction: Tensor,
+        terminated: Tensor,
+        memory: tuple[Tensor, Tensor],
+        first: Tensor | None = None,
+    ) -> ControllerOutput:
+        """Run the policy over sequences.
+
+        Args:
+            frame: o_cam, uint8 [B, T, 64, 64, 3].
+            proprio: o_pr, [B, T, P].
+            instruction: A, int64 [B, T].
+            terminated: beta, bool [B, T].
+            memory: LSTM output and cell before the first tick, [B, H] each.
+            first: Ticks before which an episode begins and the memory is cleared, bool [B, T].
+        """
+        b, t = instruction.shape
+        seen = self.encode(frame.flatten(0, 1))
+        felt = self.embed(proprio.flatten(0, 1), instruction.flatten(), terminated.flatten())
+        # Shape [B, T, F].
+        mixed = self.mix(torch.cat([seen, felt], -1)).view(b, t, -1)
+        h, c = memory
+        outputs = []
+        for i in range(t):
+            if first is not None:
+                keep = (~first[:, i, None]).to(h.dtype)
+                h, c = h * keep, c * keep
+            h, c = self.lstm(mixed[:, i], (h, c))
+            outputs.append(h)
+        features = torch.cat([torch.stack(outputs, 1), mixed], -1)
+        return ControllerOutput(self.distribution(features), features, (h, c))
+
+    def distribution(self, features: Tensor) -> Gaussian:
+        """Return the distribution over torques given `ControllerOutput.features`."""
+        x = self.trunk(features)
+        unit = math.log(math.expm1(1.0))
+        return Gaussian(self.mean(x), INITIAL_SCALE * F.softplus(self.scale(x) + unit) + MIN_SCALE)
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return zeros: LSTM output and cell, [B, H] each."""
+        weight = self.mean.weight
+        return tuple(torch.zeros(batch, self.hidden, device=weight.device) for _ in range(2))
+
+    @torch.inference_mode()
+    def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
+        """Return the mean torque limited to [-1, 1], [B, U], and the next memory."""
+        output = self.forward(*self.to_tensors(inputs), memory=(state[0], state[1]))
+        return output.action.mean[:, 0].clamp(-1.0, 1.0).cpu().numpy(), output.memory
+
+    def to_tensors(self, inputs: ControllerInput) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return one tick's observations, [B, ...], as sequences of one tick, [B, 1, ...], on the module's device."""
+        device = self.mean.weight.device
+        arrays = (
+            np.ascontiguousarray(inputs.frame),
+            np.asarray(inputs.proprio, np.float32),
+            np.asarray(inputs.instruction, np.int64),
+            np.asarray(inputs.terminated, np.bool_),
+        )
+        frame, proprio, instruction, terminated = (torch.from_numpy(a).to(device).unsqueeze(1) for a in arrays)
+        return frame, proprio, instruction, terminated
