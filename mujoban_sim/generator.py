@@ -1,0 +1,248 @@
+"""Generated levels, after Racaniere et al. 2017 ("Imagination-Augmented Agents", appendix on Sokoban levels).
+
+1. *Room*: a random walk carves floor with small patterns out of a solid block.
+2. *Targets*: distinct random floor squares, with a box on each.
+3. *Reverse play*: a random depth-first search pulls boxes backwards from that solved state; of the states that it
+   visits, the level starts from the hardest one by the score (changes of the pulled box) x (total displacement of
+   boxes). Each start is reached from the solved state by pulls, so pushes solve it: every level is solvable.
+
+One seed and difficulty give one level, on every machine.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mujoban_sim.bitboard import NONE, SIDE, SQUARE_STEP, SQUARES, Bits, bit, count, flood, lowest, shift
+from mujoban_sim.grid import DIFFICULTIES, GRID_SIZE
+from mujoban_sim.levels import Level
+
+TEST_SEEDS: Final = range(0, 10_000_000)
+"""Seeds of what users play and of every evaluation."""
+TRAIN_SEEDS: Final = range(10_000_000, 2**62)
+"""Seeds of training."""
+
+# Carving patterns, the walker in the middle; those of Racaniere et al. as published in gym-sokoban.
+_PATTERNS: Final = np.array(
+    [
+        [[0, 0, 0], [1, 1, 1], [0, 0, 0]],
+        [[0, 1, 0], [0, 1, 0], [0, 1, 0]],
+        [[0, 0, 0], [1, 1, 0], [0, 1, 0]],
+        [[0, 0, 0], [1, 1, 0], [1, 1, 0]],
+        [[0, 0, 0], [0, 1, 1], [0, 1, 0]],
+    ],
+    np.bool_,
+)
+_TURN_PROBABILITY: Final = 0.35
+_STEPS_PER_SIDE: Final = 3.4
+_REVERSE_STATES: Final = 3000
+"""States that reverse play visits at most."""
+_TABLE_BITS: Final = 13
+
+
+class LevelBatch(NamedTuple):
+    """Levels as arrays, for vectorised consumers. Shapes: B levels, K boxes, N = `grid.GRID_SIZE`."""
+
+    wall: NDArray[np.bool_]
+    """[B, N, N]."""
+    target: NDArray[np.bool_]
+    """[B, N, N]."""
+    boxes: NDArray[np.int64]
+    """(row, column), sorted, [B, K, 2]."""
+    player: NDArray[np.int64]
+    """(row, column), [B, 2]."""
+
+
+@njit(cache=True, nogil=True)
+def _below(rng: np.random.Generator, n: int) -> int:
+    """Draw uniformly from 0..n-1; from `random` alone, whose stream NumPy keeps stable."""
+    return int(rng.random() * n)
+
+
+@njit(cache=True, nogil=True)
+def _carve_room(rng: np.random.Generator, size: int) -> Bits:
+    """Return the floor that a random walk carves into a grid of `size`, placed as a level text would be."""
+    low = (GRID_SIZE - size) // 2
+    side = size - 2
+    row, col = _below(rng, side), _below(rng, side)
+    direction = _below(rng, 4)
+    floor = NONE
+    for _ in range(int(_STEPS_PER_SIDE * size)):
+        if rng.random() < _TURN_PROBABILITY:
+            direction = _below(rng, 4)
+        step = SQUARE_STEP[direction]
+        if abs(step) == SIDE:
+            row = min(max(row + step // SIDE, 0), side - 1)
+        else:
+            col = min(max(col + step, 0), side - 1)
+        pattern = _PATTERNS[_below(rng, len(_PATTERNS))]
+        for i in range(3):
+            for j in range(3):
+                r, c = row + i - 1, col + j - 1
+                if pattern[i, j] and 0 <= r < side and 0 <= c < side:
+                    floor |= bit((r + low) * SIDE + c + low)
+    return floor
+
+
+@njit(cache=True, nogil=True)
+def _random_square(rng: np.random.Generator, bits: Bits) -> int:
+    skip = _below(rng, count(bits))
+    for _ in range(skip):
+        bits &= bits - np.uint64(1)
+    return lowest(bits)
+
+
+@njit(cache=True, nogil=True)
+def _insert(table_boxes: NDArray[np.uint64], table_player: NDArray[np.uint64], boxes: Bits, region: Bits) -> bool:
+    """Add a state to an open-addressing set; false when it was there. An empty slot has no boxes."""
+    mask = np.uint64(len(table_boxes) - 1)
+    slot = ((boxes ^ (region * np.uint64(0xD6E8FEB86659FD93))) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(40)
+    slot &= mask
+    while table_boxes[slot] != NONE:
+        if table_boxes[slot] == boxes and table_player[slot] == region:
+            return False
+        slot = (slot + np.uint64(1)) & mask
+    table_boxes[slot], table_player[slot] = boxes, region
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _reverse_play(
+    rng: np.random.Generator, floor: Bits, home: NDArray[np.int64], player: int, boxes_out: NDArray[np.int64]
+) -> int:
+    """Write the boxes of the hardest visited start to `boxes_out` [K]; return its player square, or -1 if none."""
+    k_boxes = len(home)
+    targets = NONE
+    for k in range(k_boxes):
+        targets |= bit(home[k])
+    table_boxes = np.zeros(1 << _TABLE_BITS, np.uint64)
+    table_player = np.zeros(1 << _TABLE_BITS, np.uint64)
+    # A state of the stack: boxes, player, box pulled last, number of changes of the pulled box.
+    capacity = _REVERSE_STATES + 4 * k_boxes
+    stack = np.empty((capacity, k_boxes + 3), np.int64)
+    stack[0, :k_boxes] = home
+    stack[0, k_boxes], stack[0, k_boxes + 1], stack[0, k_boxes + 2] = player, -1, 0
+    top, visited, best, best_player = 1, 1, 0, -1
+    while top > 0:
+        top -= 1
+        state = stack[top].copy()
+        position = state[:k_boxes]
+        boxes = NONE
+        displacement = 0
+        for k in range(k_boxes):
+            boxes |= bit(position[k])
+            displacement += abs(position[k] // SIDE - home[k] // SIDE) + abs(position[k] % SIDE - home[k] % SIDE)
+        score = state[k_boxes + 2] * displacement
+        if score > best and boxes & targets == NONE and targets & bit(state[k_boxes]) == NONE:
+            best, best_player = score, state[k_boxes]
+            boxes_out[:] = position
+        free = floor & ~boxes
+        region = flood(bit(state[k_boxes]), free)
+        first = top
+        for k in range(k_boxes):
+            for direction in range(4):
+                beside = shift(bit(position[k]), direction) & region
+                beyond = shift(beside, direction) & free
+                if beyond == NONE or visited >= _REVERSE_STATES:
+                    continue
+                pulled = (boxes & ~bit(position[k])) | beside
+                after = flood(beyond, floor & ~pulled)
+                if not _insert(table_boxes, table_player, pulled, bit(lowest(after))):
+                    continue
+                visited += 1
+                stack[top] = state
+                stack[top, k] = lowest(beside)
+                stack[top, k_boxes] = lowest(beyond)
+                stack[top, k_boxes + 1] = k
+                stack[top, k_boxes + 2] += state[k_boxes + 1] != k
+                top += 1
+        for i in range(top - 1, first, -1):
+            j = first + _below(rng, i - first + 1)
+            for column in range(k_boxes + 3):
+                stack[i, column], stack[j, column] = stack[j, column], stack[i, column]
+    return best_player
+
+
+@njit(cache=True, nogil=True)
+def _generate(
+    rng: np.random.Generator,
+    size: int,
+    wall: NDArray[np.bool_],
+    target: NDArray[np.bool_],
+    boxes: NDArray[np.int64],
+    player: NDArray[np.int64],
+) -> None:
+    """Write one level; draws rooms until one has a start."""
+    k_boxes = len(boxes)
+    home = np.empty(k_boxes, np.int64)
+    start = np.empty(k_boxes, np.int64)
+    while True:
+        floor = _carve_room(rng, size)
+        if count(floor) < 2 * k_boxes + 2:
+            continue
+        free = floor
+        for k in range(k_boxes):
+            home[k] = _random_square(rng, free)
+            free &= ~bit(home[k])
+        square = _reverse_play(rng, floor, home, _random_square(rng, free), start)
+        if square >= 0:
+            break
+    wall[:], target[:] = True, False
+    for s in range(SQUARES):
+        wall[s // SIDE + 1, s % SIDE + 1] = floor & bit(s) == NONE
+    start.sort()
+    for k in range(k_boxes):
+        target[home[k] // SIDE + 1, home[k] % SIDE + 1] = True
+        boxes[k, 0], boxes[k, 1] = start[k] // SIDE + 1, start[k] % SIDE + 1
+    player[0], player[1] = square // SIDE + 1, square % SIDE + 1
+
+
+def _rng(difficulty: int, seed: int) -> np.random.Generator:
+    if seed < 0:
+        raise ValueError(f"seed {seed} is negative: expected an integer from 0")
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence([difficulty, seed])))
+
+
+def generate_batch(difficulty: int, seeds: Iterable[int]) -> LevelBatch:
+    """Generate the levels of several seeds as arrays.
+
+    Args:
+        difficulty: key of `grid.DIFFICULTIES`.
+        seeds: one non-negative integer a level.
+
+    Raises:
+        ValueError: If the difficulty is unknown or a seed is negative.
+    """
+    if difficulty not in DIFFICULTIES:
+        raise ValueError(f"unknown difficulty {difficulty!r}: expected one of {', '.join(map(str, DIFFICULTIES))}")
+    size, k_boxes = DIFFICULTIES[difficulty]
+    seeds = [operator.index(seed) for seed in seeds]
+    batch = LevelBatch(
+        np.empty((len(seeds), GRID_SIZE, GRID_SIZE), np.bool_),
+        np.empty((len(seeds), GRID_SIZE, GRID_SIZE), np.bool_),
+        np.empty((len(seeds), k_boxes, 2), np.int64),
+        np.empty((len(seeds), 2), np.int64),
+    )
+    for i, seed in enumerate(seeds):
+        _generate(_rng(difficulty, seed), size, *(array[i] for array in batch))
+    return batch
+
+
+def generate_levels(difficulty: int, seeds: Sequence[int]) -> list[Level]:
+    """Generate the levels of several seeds; see `generate_batch`."""
+    batch = generate_batch(difficulty, seeds)
+    return [
+        Level(wall, target, boxes, (int(player[0]), int(player[1])), name=f"{difficulty}/{seed}", seed=int(seed))
+        for wall, target, boxes, player, seed in zip(*batch, seeds, strict=True)
+    ]
+
+
+def generate_level(difficulty: int, seed: int) -> Level:
+    """Generate the level of one seed; see `generate_batch`."""
+    return generate_levels(difficulty, [seed])[0]
