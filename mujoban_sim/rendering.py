@@ -10,7 +10,7 @@ import importlib
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import mujoco
 import numpy as np
@@ -25,11 +25,9 @@ from mujoban_sim.appearance import (
 from mujoban_sim.bodies import FIRST_PERSON_CAMERA, Body
 from mujoban_sim.camera import FRAME_SIZE, in_view
 from mujoban_sim.grid import GRID_SIZE, cell_to_xy
+from mujoban_sim.levels import Level
 from mujoban_sim.render_scene import TOP_DOWN_CAMERA, UNSEEN_GROUP, RenderScene, build_scene, write_level
 from mujoban_sim.scene import BOX_HALF_EXTENT
-
-if TYPE_CHECKING:
-    from mujoban_sim.levels import Level
 
 CameraName = Literal["first_person", "top_down"]
 CAMERAS: Final[tuple[CameraName, ...]] = (FIRST_PERSON_CAMERA, TOP_DOWN_CAMERA)
@@ -86,6 +84,11 @@ class _Painter:
     def submit(self, function: Callable[..., _T], *args: Any) -> Future[_T]:
         """Run a function in the painter's thread."""
         return self._thread.submit(function, *args)
+
+    @property
+    def qpos_size(self) -> int:
+        """Return nq, the number of generalised positions."""
+        return self._scene.model.nq
 
     def _open(self) -> RenderScene:
         scene = build_scene(self._body, self._max_boxes, self._slots, self._size)
@@ -190,7 +193,7 @@ class FrameRenderer:
         self._painters = [
             _Painter(body, max_boxes, len(range(first, batch, threads)), size) for first in range(threads)
         ]
-        self._qpos_size = 3 * max_boxes + body.qpos_size
+        self._qpos_size = self._painters[0].qpos_size
         self._targets = np.zeros((batch, max_boxes, 2))
         self._has_target = np.zeros((batch, max_boxes), np.bool_)
         self._ready = np.zeros(batch, np.bool_)
