@@ -6,8 +6,7 @@ coordinates follow those of the boxes (see `mujoban_sim.scene`). A body's root i
 - ``"slides"``: slide joints x, y, z, then a hinge about z whose angle is the heading, then the inner joints; or
 - ``"free"``: a free joint (position, quaternion), then the inner joints.
 
-In both cases the first two coordinates are the position in the frame ``map`` in metres, and z = 0 is the
-height at which the robot rests (``"slides"``) or the body's ``spawn_height`` (``"free"``).
+In both cases the first two coordinates are the position in the frame ``map`` in metres.
 """
 
 from __future__ import annotations
@@ -16,6 +15,9 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mujoban_sim.camera import CameraMount
 from mujoban_sim.grid import TIME_LIMIT
@@ -63,12 +65,9 @@ class Body:
         joint_qpos: their offsets among the robot's positions.
         joint_qvel: their offsets among the robot's velocities.
         actuators: motors in the order of the torque's U components.
-        qpos_size: number of the robot's positions.
-        qvel_size: number of the robot's velocities.
+        rest_qpos: the robot's positions when it stands at the map's origin and heads east; it settles from there.
         cell_size: edge of a cell in metres; the world is scaled by it, box mass and peg size are not (A.3).
         time_limit: steps of an episode at 20 Hz (240 s for the ball, 480 s for the ant).
-        spawn_height: z of the root at rest.
-        radius: horizontal radius in metres within which the robot touches nothing else when it is placed.
         camera: how the body carries its first-person camera.
         mjcf: the ``<body>`` element, with the camera `FIRST_PERSON_CAMERA` and the site ``imu``.
     """
@@ -79,12 +78,9 @@ class Body:
     joint_qpos: tuple[int, ...]
     joint_qvel: tuple[int, ...]
     actuators: tuple[Actuator, ...]
-    qpos_size: int
-    qvel_size: int
+    rest_qpos: tuple[float, ...]
     cell_size: float
     time_limit: int
-    spawn_height: float
-    radius: float
     camera: CameraMount
     mjcf: str
 
@@ -97,6 +93,19 @@ class Body:
     def proprio_size(self) -> int:
         """P, the number of proprioceptive values."""
         return INERTIAL_SIZE + 2 * len(self.joints) + UP_AXIS_SIZE
+
+    @property
+    def qpos_size(self) -> int:
+        """Number of the robot's positions."""
+        return len(self.rest_qpos)
+
+    def set_pose(self, qpos: NDArray[np.float64], pose: NDArray[np.float64]) -> None:
+        """Move the robot with positions `qpos` to a pose (x [m], y [m], psi [rad]); its height and posture stay."""
+        qpos[:2] = pose[:2]
+        if self.root == "slides":
+            qpos[3] = pose[2]
+        else:
+            qpos[3:7] = (math.cos(pose[2] / 2), 0.0, 0.0, math.sin(pose[2] / 2))
 
     @cached_property
     def actuator_mjcf(self) -> str:
@@ -152,12 +161,9 @@ BALL: Final = Body(
     joint_qpos=(4, 3),
     joint_qvel=(4, 3),
     actuators=(Actuator("roll", 20.0), Actuator("steer", 20.0)),
-    qpos_size=5,
-    qvel_size=5,
+    rest_qpos=(0.0, 0.0, 0.0, 0.0, 0.0),
     cell_size=1.0,
     time_limit=TIME_LIMIT,
-    spawn_height=0.0,
-    radius=0.2,
     camera=_BALL_CAMERA,
     mjcf=_BALL_MJCF,
 )

@@ -1,0 +1,231 @@
+"""The completion rule of an abstract instruction (paper C.4): the only place where it stands.
+
+An instruction issued in cell c towards its neighbour d is
+
+- a *move* when d is free: completed when the robot is within `tolerance` of d's centre;
+- a *push* when d holds a box and the cell e behind d is free: completed when that box is within `tolerance`
+  of e's centre and slower than `max_box_speed` (a refinement of the paper's rule, which knows no speed: a box
+  that coasts past a centre catches a peg on its next push); the robot's own position does not matter;
+- a *hold* otherwise (stay; or infeasible, because d is a wall or its box is blocked): completed when the robot is
+  within `tolerance` of the centre of c, the cell in which it must remain.
+
+The origin c is the cell that the instruction before led to, if that was completed; else the cell in which the
+robot is. The distinction matters after a push, when the robot stands almost half a cell off c's centre.
+
+Shapes: B robots, K boxes, N rows and columns of the grid, M selected rows.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mujoban_sim.grid import CELL_SIZE, COMPLETION_TOLERANCE, GRID_SIZE, OFFSETS_RC, Instruction
+
+MAX_BOX_SPEED: Final = 0.3
+"""Speed in m/s (of a world with 1 m cells; scaled with the cell) below which a pushed box counts as placed."""
+
+
+class GoalKind(IntEnum):
+    """What an instruction asks for where it was issued."""
+
+    MOVE = 0
+    PUSH = 1
+    HOLD = 2
+    NONE = 3
+    """No instruction has been issued in the episode yet."""
+
+
+_MOVE, _PUSH, _HOLD, _NONE = (int(k) for k in GoalKind)
+_HALF: Final = (GRID_SIZE - 1) / 2
+
+
+@njit(cache=True, nogil=True)
+def is_completed(
+    kind: int,
+    robot_offset: tuple[float, float],
+    box_offset: tuple[float, float],
+    box_speed: float,
+    tolerance: float,
+    max_box_speed: float,
+) -> bool:
+    """Return whether a goal is reached; offsets from the targets, tolerance and speeds in metres (per second)."""
+    if kind == _PUSH:
+        return np.hypot(box_offset[0], box_offset[1]) < tolerance and box_speed < max_box_speed
+    return kind != _NONE and np.hypot(robot_offset[0], robot_offset[1]) < tolerance
+
+
+@njit(cache=True, nogil=True)
+def _is_wall(wall: NDArray[np.bool_], row: int, col: int) -> bool:
+    return not (0 <= row < wall.shape[0] and 0 <= col < wall.shape[1]) or wall[row, col]
+
+
+@njit(cache=True, nogil=True)
+def _box_at(box_cell: NDArray[np.int64], row: int, col: int) -> int:
+    for k in range(box_cell.shape[0]):
+        if box_cell[k, 0] == row and box_cell[k, 1] == col:
+            return k
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _begin(
+    rows: NDArray[np.int64],
+    instruction: NDArray[np.int64],
+    wall: NDArray[np.bool_],
+    agent_cell: NDArray[np.int64],
+    box_cell: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+    cell_size: float,
+    reached: NDArray[np.bool_],
+    goal_cell: NDArray[np.int64],
+    origin_cell: NDArray[np.int64],
+    direction: NDArray[np.int64],
+    kind: NDArray[np.int64],
+    robot_target: NDArray[np.float64],
+    box_index: NDArray[np.int64],
+    box_target: NDArray[np.float64],
+) -> None:
+    for m in range(rows.shape[0]):
+        b = rows[m]
+        row, col = agent_cell[b]
+        if reached[b]:
+            row, col = goal_cell[b]
+        step_row, step_col = offsets[instruction[b]]
+        to_row, to_col = row + step_row, col + step_col
+        box = _box_at(box_cell[b], to_row, to_col)
+        goal = _MOVE
+        if (step_row == 0 and step_col == 0) or _is_wall(wall[b], to_row, to_col):
+            goal = _HOLD
+        elif box >= 0:
+            blocked = _is_wall(wall[b], to_row + step_row, to_col + step_col)
+            goal = _HOLD if blocked or _box_at(box_cell[b], to_row + step_row, to_col + step_col) >= 0 else _PUSH
+        if goal == _HOLD:
+            to_row, to_col = row, col
+        direction[b], kind[b], reached[b] = instruction[b], goal, False
+        origin_cell[b, 0], origin_cell[b, 1] = row, col
+        goal_cell[b, 0], goal_cell[b, 1] = to_row, to_col
+        robot_target[b, 0], robot_target[b, 1] = (to_col - _HALF) * cell_size, (_HALF - to_row) * cell_size
+        box_index[b] = box if goal == _PUSH else 0
+        box_target[b, 0] = robot_target[b, 0] + step_col * cell_size
+        box_target[b, 1] = robot_target[b, 1] - step_row * cell_size
+
+
+@njit(cache=True, nogil=True)
+def _check(
+    kind: NDArray[np.int64],
+    robot_target: NDArray[np.float64],
+    box_index: NDArray[np.int64],
+    box_target: NDArray[np.float64],
+    robot_position: NDArray[np.floating],
+    box_position: NDArray[np.floating],
+    box_speed: NDArray[np.floating],
+    tolerance: float,
+    max_box_speed: float,
+    reached: NDArray[np.bool_],
+) -> None:
+    for b in range(kind.shape[0]):
+        k = box_index[b]
+        robot = (robot_position[b, 0] - robot_target[b, 0], robot_position[b, 1] - robot_target[b, 1])
+        box = (box_position[b, k, 0] - box_target[b, 0], box_position[b, k, 1] - box_target[b, 1])
+        reached[b] = is_completed(kind[b], robot, box, box_speed[b, k], tolerance, max_box_speed)
+
+
+class GoalTracker:
+    """Goals of the instructions in force of B robots, and whether they are completed.
+
+    Attributes:
+        direction: `Instruction` in force, int64 [B].
+        kind: `GoalKind` of each, int64 [B].
+        origin_cell: cell from which the instruction counts, (row, column), int64 [B, 2].
+        goal_cell: cell to which it leads the robot, int64 [B, 2].
+        robot_target: centre of `goal_cell` in the map frame [m], float64 [B, 2].
+        box_index: the box to be pushed, int64 [B]; 0 unless `kind` is PUSH.
+        box_target: where it is to be pushed in the map frame [m], float64 [B, 2]; meaningless unless PUSH.
+        reached: result of the last check, bool [B]; false since the instruction was issued until one is made.
+    """
+
+    def __init__(
+        self,
+        batch: int,
+        *,
+        cell_size: float = CELL_SIZE,
+        tolerance: float = COMPLETION_TOLERANCE,
+        max_box_speed: float = MAX_BOX_SPEED,
+    ) -> None:
+        """Track `batch` robots; `tolerance` in cells, `max_box_speed` in cells per second (`inf`: the paper's rule).
+
+        Raises:
+            ValueError: if the tolerance or the speed is not positive.
+        """
+        if not (tolerance > 0 and max_box_speed > 0):
+            raise ValueError(f"tolerance {tolerance} and max_box_speed {max_box_speed}: expected positive numbers")
+        self.cell_size = cell_size
+        self.tolerance = tolerance * cell_size
+        self.max_box_speed = max_box_speed * cell_size
+        self.direction = np.zeros(batch, np.int64)
+        self.kind = np.full(batch, GoalKind.NONE, np.int64)
+        self.origin_cell = np.zeros((batch, 2), np.int64)
+        self.goal_cell = np.zeros((batch, 2), np.int64)
+        self.robot_target = np.zeros((batch, 2))
+        self.box_index = np.zeros(batch, np.int64)
+        self.box_target = np.zeros((batch, 2))
+        self.reached = np.zeros(batch, np.bool_)
+
+    def reset(self, rows: NDArray[np.int64]) -> None:
+        """Forget the instructions of the given rows, [M], as at an episode's start."""
+        self.direction[rows] = Instruction.STAY
+        self.kind[rows] = GoalKind.NONE
+        self.reached[rows] = False
+
+    def begin(
+        self,
+        rows: NDArray[np.int64],
+        direction: NDArray[np.int64],
+        wall: NDArray[np.bool_],
+        agent_cell: NDArray[np.int64],
+        box_cell: NDArray[np.int64],
+    ) -> None:
+        """Put new instructions in force.
+
+        Args:
+            rows: rows that get a new instruction, int64 [M].
+            direction: instructions of all rows, int64 [B]; only those of `rows` are read.
+            wall: [B, N, N].
+            agent_cell: the robots' cells, int64 [B, 2].
+            box_cell: the boxes' cells, int64 [B, K, 2]; (-1, -1) where there is none.
+
+        Raises:
+            ValueError: if an instruction is not one of `Instruction`.
+        """
+        chosen = direction[rows]
+        if chosen.size and (chosen.min() < 0 or chosen.max() >= len(Instruction)):
+            raise ValueError(f"instructions {chosen.tolist()}: expected 0 (stay) to {len(Instruction) - 1} (west)")
+        _begin(
+            rows, direction, wall, agent_cell, box_cell, OFFSETS_RC, self.cell_size,
+            self.reached, self.goal_cell, self.origin_cell, self.direction, self.kind,
+            self.robot_target, self.box_index, self.box_target,
+        )  # fmt: skip
+
+    def completed(
+        self,
+        robot_position: NDArray[np.floating],
+        box_position: NDArray[np.floating],
+        box_speed: NDArray[np.floating],
+    ) -> NDArray[np.bool_]:
+        """Check and return which instructions in force are completed, [B].
+
+        Args:
+            robot_position: in the map frame [m], [B, 2] or more columns, of which the first two count.
+            box_position: in the map frame [m], [B, K, 2].
+            box_speed: [m/s], [B, K].
+        """
+        _check(
+            self.kind, self.robot_target, self.box_index, self.box_target,
+            robot_position, box_position, box_speed, self.tolerance, self.max_box_speed, self.reached,
+        )  # fmt: skip
+        return self.reached

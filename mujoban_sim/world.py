@@ -1,0 +1,401 @@
+"""Batched physical Sokoban: physics, observations, rewards and ground truth of B robots (paper appendix B).
+
+Shapes: B robots, K boxes, P proprioceptive values, U actuators, N rows and columns of the grid, M selected rows.
+All positions are metres in the frame ``map``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import ArrayLike, NDArray
+
+from mujoban_sim.bodies import FIRST_PERSON_CAMERA, get_body
+from mujoban_sim.camera import FRAME_SIZE
+from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
+from mujoban_sim.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, cell_to_xy, xy_to_cell
+from mujoban_sim.interfaces import GroundTruth, Observation
+from mujoban_sim.scene import BOX_COORDINATES, PHYSICS_STEP, SUBSTEPS, SceneCache, parked_position
+from mujoban_sim.world_kernels import apply_torque, fill_abstract_state, update
+
+if TYPE_CHECKING:
+    from mujoban_sim.levels import Level
+    from mujoban_sim.rendering import CameraName, FrameRenderer
+
+_STAGE_NONE: Final = int(mujoco.mjtStage.mjSTAGE_NONE)
+_STAGE_VELOCITY: Final = int(mujoco.mjtStage.mjSTAGE_VEL)
+_SETTLING_TIME: Final = 2.0
+_HEADING_STREAM: Final = 1
+"""Tells the heading's random stream from others that an episode's seed governs."""
+
+
+class TorqueError(ValueError):
+    """A torque has the wrong shape, is not finite or lies outside [-1, 1]; the world has not moved."""
+
+
+@dataclass(frozen=True)
+class EpisodeSpec:
+    """What fixes an episode: the level, and the seed of initial heading and appearance."""
+
+    level: Level
+    seed: int
+
+
+def initial_heading(seed: int) -> float:
+    """Return the robot's heading psi at the start of the episode with the given seed, in [-pi, pi)."""
+    return float(np.random.default_rng([_HEADING_STREAM, seed]).uniform(-np.pi, np.pi))
+
+
+class World:
+    """B independent Mujoban worlds that step together at 20 Hz.
+
+    A row is an episode: `reset` starts it, `instruct` tells which instruction it follows, `step` applies
+    torques. A row whose episode has ended (solved or truncated) keeps moving, but its reward is zero and its
+    counters stand still until it is reset. The same level, seed and torques give the same values exactly, in
+    every process and whatever ran in the row before.
+
+    The arrays are live: they change in place. Copy what you keep (`observation` and `truth` return copies).
+
+    Attributes:
+        body: the robot's `Body`.
+        pose: (x [m], y [m], psi [rad], in [-pi, pi]) of the robot, float32 [B, 3].
+        velocity: (vx [m/s], vy [m/s], yaw rate [rad/s]) in the map frame, float32 [B, 3].
+        proprio: o_pr, layout in `mujoban_sim.bodies.Body`, float32 [B, P].
+        box_position: o_box, float32 [B, K, 2]; boxes that a level lacks lie far outside the grid.
+        box_speed: [m/s], float32 [B, K].
+        box_count: boxes of each level, int64 [B].
+        wall: bool [B, N, N].
+        target: bool [B, N, N].
+        agent_cell: (row, column) of the robot, int64 [B, 2]. If it rounds into a box's cell it keeps its last cell.
+        box_cell: (row, column) of the boxes, int64 [B, K, 2]; (-1, -1) for those that a level lacks.
+        box_on_target: bool [B, K]. A box is on a target when at least half of it in both axes lies within the pad.
+        reward: of the last step: +1 for a box onto a target, -1 off one, +10 for solving; float32 [B].
+        episode_return: sum of the rewards, float32 [B].
+        steps: steps of the episode so far, int64 [B].
+        solved: whether all boxes have been on targets at once, which ends the episode; bool [B].
+        truncated: whether the time limit ended the episode, bool [B].
+        goals: goals of the instructions in force.
+    """
+
+    def __init__(
+        self,
+        batch: int,
+        *,
+        body: str = "ball",
+        max_boxes: int = 4,
+        time_limit: int | None = None,
+        threads: int = 1,
+        tolerance: float = COMPLETION_TOLERANCE,
+        max_box_speed: float = MAX_BOX_SPEED,
+        cached_scenes: int = 1024,
+    ) -> None:
+        """Make B worlds; every row must be reset before the first step.
+
+        Args:
+            batch: B.
+            body: name of the robot's body, a key of `mujoban_sim.bodies.BODIES`.
+            max_boxes: K, the most boxes of any level to be played.
+            time_limit: steps after which an episode is truncated; None: the body's (240 s for the ball).
+            threads: threads for physics; the results do not depend on it.
+            tolerance: tolerance of the completion rule in cells.
+            max_box_speed: speed in cells per second below which a pushed box counts as placed.
+            cached_scenes: compiled levels to keep.
+
+        Raises:
+            ValueError: if an argument is out of its range.
+        """
+        for name, value in (("batch", batch), ("max_boxes", max_boxes), ("threads", threads)):
+            if value < 1:
+                raise ValueError(f"{name} is {value}: expected at least 1")
+        self.body = get_body(body)
+        self.batch = batch
+        self.max_boxes = max_boxes
+        self.time_limit = self.body.time_limit if time_limit is None else time_limit
+        if self.time_limit < 1:
+            raise ValueError(f"time_limit is {time_limit}: expected at least 1 step")
+        self.goals = GoalTracker(batch, cell_size=self.body.cell_size, tolerance=tolerance, max_box_speed=max_box_speed)
+        self._threads = threads
+        self._all_rows = np.arange(batch)
+        self._renderers: dict[int, FrameRenderer] = {}
+        self._episodes: list[EpisodeSpec | None] = [None] * batch
+        self._undrawn: dict[int, set[int]] = {}
+        self._started = False
+        self._allocate()
+        self._start_physics(cached_scenes)
+
+    def _allocate(self) -> None:
+        b, k, n = self.batch, self.max_boxes, GRID_SIZE
+        self.pose = np.zeros((b, 3), np.float32)
+        self.velocity = np.zeros((b, 3), np.float32)
+        self.proprio = np.zeros((b, self.body.proprio_size), np.float32)
+        self.box_position = np.zeros((b, k, 2), np.float32)
+        self.box_speed = np.zeros((b, k), np.float32)
+        self.box_count = np.zeros(b, np.int64)
+        self.wall = np.ones((b, n, n), np.bool_)
+        self.target = np.zeros((b, n, n), np.bool_)
+        self.agent_cell = np.zeros((b, 2), np.int64)
+        self.box_cell = np.full((b, k, 2), -1, np.int64)
+        self._target_cell = np.full((b, k, 2), -1, np.int64)
+        self.box_on_target = np.zeros((b, k), np.bool_)
+        self.reward = np.zeros(b, np.float32)
+        self.episode_return = np.zeros(b, np.float32)
+        self.steps = np.zeros(b, np.int64)
+        self.solved = np.zeros(b, np.bool_)
+        self.truncated = np.zeros(b, np.bool_)
+
+    def _start_physics(self, cached_scenes: int) -> None:
+        self._scenes = SceneCache(self.body, self.max_boxes, cached_scenes)
+        empty = self._scenes.model(np.zeros((GRID_SIZE, GRID_SIZE), np.bool_))
+        self._models = [empty] * self.batch
+        # Each row keeps its MjData, so that sensors at the new state cost no second pass.
+        self._physics = Batch(empty, nsim=self.batch, nthread=self._threads, persistent=True)
+        self._qpos = self._physics.bind("qpos")
+        self._qvel = self._physics.bind("qvel")
+        self._ctrl = self._physics.bind("ctrl")
+        self._sensors = self._physics.bind("sensordata")
+        self._root = BOX_COORDINATES * self.max_boxes
+        self._joint_qpos = np.array(self.body.joint_qpos, np.int64)
+        self._joint_qvel = np.array(self.body.joint_qvel, np.int64)
+        self._rest_qpos = self._settle(empty)
+
+    def _settle(self, empty: mujoco.MjModel) -> NDArray[np.float64]:
+        """Return the positions, [nq], of a parked set of boxes and a robot at the origin, once contacts bear them."""
+        data = mujoco.MjData(empty)
+        for k in range(self.max_boxes):
+            data.qpos[BOX_COORDINATES * k :][:BOX_COORDINATES] = parked_position(k, self.body.cell_size)
+        data.qpos[self._root :] = self.body.rest_qpos
+        mujoco.mj_step(empty, data, round(_SETTLING_TIME / PHYSICS_STEP))
+        return data.qpos.copy()
+
+    @property
+    def completed(self) -> NDArray[np.bool_]:
+        """Whether the instruction in force is completed by the rule of paper C.4, as of the last step, [B]."""
+        return self.goals.reached
+
+    @property
+    def done(self) -> NDArray[np.bool_]:
+        """Whether the episode has ended, [B]."""
+        return self.solved | self.truncated
+
+    @property
+    def qpos(self) -> NDArray[np.float64]:
+        """Generalised positions in the layout of `mujoban_sim.scene`, [B, nq]; read only, please."""
+        return self._qpos
+
+    @property
+    def episodes(self) -> Sequence[EpisodeSpec | None]:
+        """The episode that each row plays; None where none has been started."""
+        return self._episodes
+
+    def reset(self, rows: ArrayLike, episodes: Sequence[EpisodeSpec]) -> None:
+        """Start episodes.
+
+        Args:
+            rows: rows to restart, int [M].
+            episodes: their episodes.
+
+        Raises:
+            ValueError: if the numbers differ, a row is out of range or appears twice, or a level has too many boxes.
+        """
+        chosen = self._check_rows(rows)
+        if len(chosen) != len(episodes):
+            raise ValueError(f"{len(chosen)} rows but {len(episodes)} episodes: expected one each")
+        for episode in episodes:
+            if len(episode.level.boxes) > self.max_boxes:
+                raise ValueError(
+                    f"level {episode.level.name!r} has {len(episode.level.boxes)} boxes: "
+                    f"expected at most max_boxes = {self.max_boxes}"
+                )
+        models = [self._scenes.model(e.level.wall) for e in episodes]
+        for row, episode, model in zip(chosen.tolist(), episodes, models, strict=True):
+            level = episode.level
+            self._episodes[row] = episode
+            self._models[row] = model
+            self.wall[row], self.target[row] = level.wall, level.target
+            self.box_count[row] = len(level.boxes)
+            self._target_cell[row] = -1
+            self._target_cell[row, : len(level.boxes)] = np.argwhere(level.target)
+            self.agent_cell[row] = level.player
+        self._started = self._started or None not in self._episodes
+        for undrawn in self._undrawn.values():
+            undrawn.update(chosen.tolist())
+        self._physics.set_models(self._models)
+        for counter in (self.reward, self.episode_return, self.steps, self.solved, self.truncated):
+            counter[chosen] = 0
+        self.goals.reset(chosen)
+        pose = np.zeros((len(chosen), 3))
+        boxes = np.zeros((len(chosen), self.max_boxes, 2))
+        for m, episode in enumerate(episodes):
+            pose[m, :2] = cell_to_xy(episode.level.player, self.body.cell_size)
+            pose[m, 2] = initial_heading(episode.seed)
+            boxes[m, : len(episode.level.boxes)] = cell_to_xy(episode.level.boxes, self.body.cell_size)
+        self._write_state(chosen, pose, boxes)
+
+    def place(self, rows: ArrayLike, pose: ArrayLike, box_position: ArrayLike) -> None:
+        """Put robots and boxes somewhere, at rest, without reward; the instructions in force stay.
+
+        Args:
+            rows: int [M].
+            pose: (x [m], y [m], psi [rad]) of the robots, [M, 3].
+            box_position: [M, K, 2] in metres; those of boxes that a level lacks are ignored.
+
+        Raises:
+            ValueError: if a shape is wrong, a number is not finite or a row has no episode.
+        """
+        chosen = self._check_rows(rows)
+        poses, boxes = np.asarray(pose, np.float64), np.asarray(box_position, np.float64)
+        expected = (len(chosen), 3), (len(chosen), self.max_boxes, 2)
+        if (poses.shape, boxes.shape) != expected:
+            raise ValueError(f"pose and box_position have shapes {poses.shape}, {boxes.shape}: expected {expected}")
+        present = np.arange(self.max_boxes) < self.box_count[chosen, None]
+        if not (np.isfinite(poses).all() and np.isfinite(boxes[present]).all()):
+            raise ValueError("pose or box_position is not finite")
+        if any(self._episodes[row] is None for row in chosen.tolist()):
+            raise ValueError("cannot place robots in rows without an episode: call reset first")
+        self.agent_cell[chosen] = xy_to_cell(poses[:, :2], self.body.cell_size)
+        self._write_state(chosen, poses, boxes)
+
+    def _write_state(self, rows: NDArray[np.int64], pose: NDArray[np.float64], boxes: NDArray[np.float64]) -> None:
+        # Resetting also clears warm starts and whatever else a row's MjData remembers.
+        self._physics.reset(ids=rows, stage=_STAGE_NONE)
+        root, body = self._root, self.body
+        for m, row in enumerate(rows.tolist()):
+            q, count = self._qpos[row], self.box_count[row]
+            q[:] = self._rest_qpos
+            q[:root].reshape(-1, BOX_COORDINATES)[:count, :2] = boxes[m, :count]
+            body.set_pose(q[root:], pose[m])
+        self._physics.forward(ids=rows)
+        self._update(rows, advance=False)
+
+    def instruct(self, instruction: NDArray[np.int64], issued: NDArray[np.bool_]) -> None:
+        """Tell which instructions A_t the coming steps follow.
+
+        Args:
+            instruction: A_t, int64 [B].
+            issued: where A_t is a new instruction, bool [B]; it may equal the one before.
+
+        Raises:
+            ValueError: if a new instruction is not one of `Instruction`.
+        """
+        rows = np.flatnonzero(issued)
+        if rows.size:
+            self.goals.begin(rows, np.asarray(instruction, np.int64), self.wall, self.agent_cell, self.box_cell)
+
+    def step(self, torque: NDArray[np.float32]) -> None:
+        """Apply torques for one control period of 50 ms.
+
+        Args:
+            torque: normalised to [-1, 1], [B, U].
+
+        Raises:
+            TorqueError: if they have another shape, are not finite or lie outside [-1, 1]; nothing has moved then.
+            RuntimeError: if a row has never been reset.
+        """
+        action = np.asarray(torque)
+        if action.shape != self._ctrl.shape:
+            raise TorqueError(f"torques have shape {action.shape}: expected {self._ctrl.shape}")
+        if not self._started:
+            raise RuntimeError("rows without an episode: call reset on all rows before step")
+        if not apply_torque(action, self._ctrl):
+            raise TorqueError(_torque_message(action))
+        self._physics.step(nstep=SUBSTEPS, stage=_STAGE_VELOCITY)
+        self._update(self._all_rows, advance=True)
+
+    def _update(self, rows: NDArray[np.int64], advance: bool) -> None:
+        goals, body = self.goals, self.body
+        update(
+            rows, advance, self._qpos, self._qvel, self._sensors, self._root, body.root == "free",
+            self._joint_qpos, self._joint_qvel, body.cell_size, self.time_limit, self.box_count, self.target,
+            goals.kind, goals.robot_target, goals.box_index, goals.box_target, goals.tolerance, goals.max_box_speed,
+            goals.reached, self.pose, self.velocity, self.proprio, self.box_position, self.box_speed,
+            self.agent_cell, self.box_cell, self.box_on_target, self.reward, self.episode_return, self.steps,
+            self.solved, self.truncated,
+        )  # fmt: skip
+
+    def abstract_state(self) -> NDArray[np.float32]:
+        """Return s_abst, binary, [B, N, N, 4]."""
+        state = np.empty((self.batch, GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32)
+        fill_abstract_state(self.wall, self.target, self.agent_cell, self.box_cell, state)
+        return state
+
+    def truth(self) -> GroundTruth:
+        """Return a copy of what only the simulator knows."""
+        return GroundTruth(
+            self.abstract_state(),
+            self.pose.copy(),
+            self.velocity.copy(),
+            self.box_position.copy(),
+            self.completed.copy(),
+        )
+
+    def observation(self) -> Observation:
+        """Return a copy of what the robots perceive; draws their frames."""
+        return Observation(self.render(), self.proprio.copy(), self.pose.copy())
+
+    def render(
+        self, camera: CameraName = FIRST_PERSON_CAMERA, rows: ArrayLike | None = None, size: int = FRAME_SIZE
+    ) -> NDArray[np.uint8]:
+        """Draw the worlds; the first call opens OpenGL.
+
+        Args:
+            camera: ``"first_person"`` (o_cam) or ``"top_down"`` (o_top, north up).
+            rows: rows to draw, int [M]; None: all.
+            size: rows and columns of a frame.
+
+        Returns:
+            RGB frames, uint8 [M, size, size, 3].
+
+        Raises:
+            RenderingError: if there is no OpenGL.
+            ValueError: if an argument is out of its range or a row has never been reset.
+        """
+        chosen = self._all_rows if rows is None else self._check_rows(rows)
+        renderer = self._renderer(size)
+        undrawn = self._undrawn[size]
+        for row in undrawn.intersection(chosen.tolist()):
+            episode = self._episodes[row]
+            if episode is None:
+                raise ValueError(f"row {row} has no episode: call reset before render")
+            renderer.set_episode(row, episode.level, episode.seed)
+            undrawn.discard(row)
+        return renderer.render(self._qpos, self._pressed(), self.box_on_target, chosen, camera)
+
+    def _renderer(self, size: int) -> FrameRenderer:
+        if size not in self._renderers:
+            # Worlds without a camera need no OpenGL.
+            from mujoban_sim.rendering import FrameRenderer
+
+            self._renderers[size] = FrameRenderer(self.batch, self.body, self.max_boxes, size, self._threads)
+            self._undrawn[size] = set(self._all_rows.tolist())
+        return self._renderers[size]
+
+    def _pressed(self) -> NDArray[np.bool_]:
+        """Return which pads carry a box, pads in row-major order, [B, K]."""
+        # Shape [B, K, K]: pad t against box k.
+        same = (self._target_cell[:, :, None] == self.box_cell[:, None]).all(-1)
+        return (same & self.box_on_target[:, None]).any(-1)
+
+    def close(self) -> None:
+        """Free the OpenGL contexts; they open again when needed."""
+        for renderer in self._renderers.values():
+            renderer.close()
+        self._renderers.clear()
+        self._undrawn.clear()
+
+    def _check_rows(self, rows: ArrayLike) -> NDArray[np.int64]:
+        chosen = np.atleast_1d(np.asarray(rows, np.int64))
+        if chosen.size and (chosen.min() < 0 or chosen.max() >= self.batch):
+            raise ValueError(f"rows {chosen.tolist()}: expected 0 to {self.batch - 1}")
+        if len(set(chosen.tolist())) != len(chosen):
+            raise ValueError(f"rows {chosen.tolist()}: expected each once")
+        return chosen
+
+
+def _torque_message(action: NDArray[np.float32]) -> str:
+    bad = np.argwhere(~(np.abs(action) <= 1.0))[0]
+    return f"torque {action[tuple(bad)]} of actuator {bad[1]} in row {bad[0]}: expected a finite number in [-1, 1]"
