@@ -164,11 +164,13 @@ class World:
         self._rest_qpos = self._settle(empty)
 
     def _settle(self, empty: mujoco.MjModel) -> NDArray[np.float64]:
-        """Return the positions, [nq], of a parked set of boxes and a robot at the origin, once contacts bear them."""
+        """Return the positions, [nq], of parked boxes and a robot, once their contacts bear them."""
         data = mujoco.MjData(empty)
         for k in range(self.max_boxes):
             data.qpos[BOX_COORDINATES * k :][:BOX_COORDINATES] = parked_position(k, self.body.cell_size)
         data.qpos[self._root :] = self.body.rest_qpos
+        # Off the pegs: the centre of a cell.
+        self.body.set_pose(data.qpos[self._root :], np.append(cell_to_xy([0, 0], self.body.cell_size), 0.0))
         mujoco.mj_step(empty, data, round(_SETTLING_TIME / PHYSICS_STEP))
         return data.qpos.copy()
 
