@@ -1,0 +1,97 @@
+"""The base of the four module nodes: a `TickNode` around a module of `mujoban_sim.interfaces`."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from mujoban_msgs.msg import Episode
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.parameter import Parameter
+
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.tick_node import Input, Output, TickNode
+from mujoban_sim.interfaces import GroundTruth
+from mujoban_sim.plugins import LEARNED, load_module
+
+TRUTH_INPUTS = (
+    Input(topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_from_msg),
+    Input(topics.TRUE_POSE, conversions.pose_from_msg),
+    Input(topics.TRUE_TWIST, conversions.twist_from_msg),
+    Input(topics.TRUE_BOXES, conversions.boxes_from_msg),
+    Input(topics.TRUE_TERMINATION, lambda message: message.terminated),
+)
+"""What a privileged module receives besides, in the order of `GroundTruth`."""
+
+
+class ModuleNode(TickNode):
+    """A thin shell around one module: messages in, one step of the module with B = 1, message out.
+
+    Parameters:
+        module: "learned", "oracle" or `package.module:Class`; fixed when the node starts.
+        weights: Weights file of the learned module; empty means those that ship. Setting it while the node
+            runs loads them, and the module's memory restarts with the next tick. Weights that cannot be loaded
+            are refused, and the old ones stay.
+        device: Device of the learned module; setting it loads the weights again.
+    """
+
+    role: ClassVar[str]
+    inputs: ClassVar[Sequence[Input]]
+
+    def __init__(self, **options: Any) -> None:
+        """Load the module and start listening.
+
+        Raises:
+            ValueError: If the module or its weights cannot be loaded.
+        """
+        super().__init__(self.role, **options)
+        self._source: str = self.declare_parameter("module", LEARNED, ParameterDescriptor(read_only=True)).value
+        weights = self.declare_parameter("weights", "").value
+        device = self.declare_parameter("device", "cpu").value
+        self.module: Any = self._load(weights, device)
+        self.state: Any = None
+        self._episode = -1
+        self.add_on_set_parameters_callback(self._on_parameters)
+        self.open_inputs([*self.inputs, *(TRUTH_INPUTS if self.module.privileged else ())])
+
+    @abstractmethod
+    def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
+        """Advance `self.state` by one tick and return what to publish."""
+
+    def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
+        """Start `self.state` at the first tick that the module sees of an episode."""
+        self.state = self.module.initial_state(np.array([episode.seed], np.int64))
+
+    def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
+        """Step the module; an episode's last tick needs no answer."""
+        if episode.terminated or episode.truncated:
+            self.state = None
+            return ()
+        if self.state is None or episode.episode != self._episode:
+            self._episode = episode.episode
+            self.begin(episode, inputs)
+        truth = None
+        if self.module.privileged:
+            truth = GroundTruth(*(np.asarray(inputs[i.topic.name])[None] for i in TRUTH_INPUTS))
+        return self.step(episode, inputs, truth)
+
+    def _load(self, weights: str, device: str) -> Any:
+        return load_module(self.role, self._source, Path(weights) if weights else None, device)
+
+    def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        changed = {p.name: p.value for p in parameters}
+        if not changed.keys() & {"weights", "device"}:
+            return SetParametersResult(successful=True)
+        weights, device = (changed.get(n, self.get_parameter(n).value) for n in ("weights", "device"))
+        try:
+            self.module = self._load(weights, device)
+        except (ValueError, OSError, RuntimeError) as error:
+            self.counts["refused weights"] += 1
+            return SetParametersResult(successful=False, reason=str(error))
+        self.state = None
+        self.counts["reloads"] += 1
+        self.get_logger().info(f"loaded {weights or 'the weights that ship'} on {device}")
+        return SetParametersResult(successful=True)

@@ -1,0 +1,174 @@
+"""The base of every node but the simulator: join the inputs of a tick, answer once, answer again when asked.
+
+A tick is known by its stamp. The simulator offers a tick by publishing its observation, and offers it again
+when no answer comes. A node that has answered already then repeats its answer from a cache, so that a
+neighbour which was restarted in between receives what it has missed.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from mujoban_msgs.msg import Episode
+from mujoban_msgs_py.conversions import stamp_of
+from mujoban_msgs_py.synchroniser import Synchroniser
+from mujoban_msgs_py.topics import EPISODE, Topic
+
+LOG_PERIOD = 5.0
+"""Seconds between two reports of bad input from one node."""
+HELD_TICKS = 8
+"""Unfinished ticks whose messages are kept."""
+
+
+class Input(NamedTuple):
+    """A topic that a node needs in every tick."""
+
+    topic: Topic
+    decode: Callable[[Any], Any]
+    """Turns the message into what the node works with; a ValueError rejects the message."""
+
+
+class Output(NamedTuple):
+    """A message to publish."""
+
+    publisher: Publisher
+    message: Any
+
+
+class TickNode(Node):
+    """A node that answers each tick of the simulator."""
+
+    def __init__(self, name: str, **options: Any) -> None:
+        """Make the node; `open_inputs` starts it."""
+        super().__init__(name, **options)
+        self.counts: Counter[str] = Counter()
+        """Events that a user should know of, such as rejected messages."""
+        self._join: Synchroniser | None = None
+        self._handled = -1
+        self._outputs: Sequence[Output] = ()
+        self._open: tuple[int, dict[str, Any]] | None = None
+        self._offers = 0
+
+    @abstractmethod
+    def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
+        """Return what to publish for a tick, or None to be asked again (see `retry`).
+
+        Args:
+            stamp: Of the tick, in nanoseconds of simulated time.
+            episode: The episode's message of this tick.
+            inputs: Topic name -> decoded message.
+            insist: Whether the simulator has offered the tick repeatedly: waiting will not help.
+        """
+
+    def open_inputs(self, inputs: Sequence[Input]) -> None:
+        """Subscribe to `/episode` and to what `answer` needs besides."""
+        every = [Input(EPISODE, _as_it_is), *inputs]
+        self._join = Synchroniser([i.topic.name for i in every], depth=HELD_TICKS)
+        for topic, decode in every:
+            self.create_subscription(topic.type, topic.name, partial(self._receive, topic, decode), topic.qos)
+
+    def retry(self) -> None:
+        """Ask `answer` again about the tick that it could not answer yet."""
+        if self._open is None:
+            return
+        stamp, inputs = self._open
+        episode = inputs[EPISODE.name]
+        outputs = self.answer(stamp, episode, inputs, insist=self._offers > MAX_PATIENCE)
+        if outputs is None:
+            return
+        self._open, self._handled, self._outputs = None, stamp, outputs
+        self._publish()
+
+    def reject(self, kind: str, reason: str) -> None:
+        """Count bad input and report it, at most once per `LOG_PERIOD`."""
+        self.counts[kind] += 1
+        self.get_logger().error(reason, throttle_duration_sec=LOG_PERIOD)
+
+    def _receive(self, topic: Topic, decode: Callable[[Any], Any], message: Any) -> None:
+        stamp = stamp_of(message)
+        if topic is EPISODE:
+            self._note_offer(stamp, message)
+        if stamp <= self._handled:
+            return
+        try:
+            item = decode(message)
+        except ValueError as error:
+            self.reject("rejected messages", f"rejected a message on {topic.name}: {error}")
+            return
+        assert self._join is not None
+        complete = self._join.add(topic.name, stamp, item)
+        if complete is not None:
+            self._open, self._offers = (stamp, complete), 0
+            self.retry()
+
+    def _note_offer(self, stamp: int, episode: Episode) -> None:
+        if stamp == self._handled:
+            self._publish()
+        elif stamp < self._handled and episode.step == 0:
+            # Time has jumped back: another simulator, or a bag that is played from its start.
+            self.get_logger().warning("simulated time jumped back: starting anew")
+            self._handled, self._open = -1, None
+        elif self._open is not None and stamp == self._open[0]:
+            self._offers += 1
+            self.retry()
+
+    def _publish(self) -> None:
+        for publisher, message in self._outputs:
+            publisher.publish(message)
+
+
+MAX_PATIENCE = 2
+"""Repeated offers of a tick after which a node answers without what it waits for."""
+
+
+def _as_it_is(message: Any) -> Any:
+    return message
+
+
+def confine_discovery() -> None:
+    """Keep discovery on this host unless the environment says otherwise; call before `rclpy.init`."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+    """Run one node in a process of its own until it is interrupted.
+
+    Args:
+        make: Makes the node; a ValueError or OSError is bad input.
+        args: Command line, with ROS arguments; None takes that of the process.
+
+    Returns:
+        Exit status: 0, or 2 after one line on stderr about bad input.
+    """
+    confine_discovery()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    rclpy.init(args=None if args is None else list(args))
+    node = None
+    try:
+        node = make()
+        executor = EventsExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (ValueError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
