@@ -59,27 +59,32 @@ _MIN_CONTRAST: Final = 0.25
 """Least distance in RGB between the colours of walls and floor."""
 
 
+@cache
+def _interpolation(size: int, count: int) -> NDArray[np.float64]:
+    """Return the weights that spread `count` periodic lattice values linearly over `size` pixels, [size, count]."""
+    place = np.arange(size) * count / size
+    first = place.astype(int)
+    weights = np.zeros((size, count))
+    rows = np.arange(size)
+    weights[rows, first] += 1.0 - (place - first)
+    weights[rows, (first + 1) % count] += place - first
+    return weights
+
+
 def _fractal_noise(rng: np.random.Generator, shape: tuple[int, int], octaves: int = 5) -> Pattern:
     """Value noise in [0, 1], periodic along both axes."""
-    total, amplitude = np.zeros(shape), 1.0
-    y, x = np.arange(shape[0]) / shape[0], np.arange(shape[1]) / shape[1]
+    total = np.zeros(shape)
     for octave in range(octaves):
         count = 4 << octave
-        lattice = rng.random((count, count))
-        row, col = y * count, x * count
-        r0, c0 = row.astype(int), col.astype(int)
-        fr, fc = (row - r0)[:, None], (col - c0)[None, :]
-        r1, c1 = (r0 + 1) % count, (c0 + 1) % count
-        upper = lattice[np.ix_(r0, c0)] * (1 - fc) + lattice[np.ix_(r0, c1)] * fc
-        lower = lattice[np.ix_(r1, c0)] * (1 - fc) + lattice[np.ix_(r1, c1)] * fc
-        total += amplitude * (upper * (1 - fr) + lower * fr)
-        amplitude *= 0.55
+        lattice = 0.55**octave * rng.random((count, count))
+        total += _interpolation(shape[0], count) @ lattice @ _interpolation(shape[1], count).T
     low, high = total.min(), total.max()
     return (total - low) / (high - low)
 
 
+@cache
 def _grid_coordinates(shape: tuple[int, int]) -> tuple[Pattern, Pattern]:
-    """Return (row, column) of pixels in cells, each of `shape`."""
+    """Return (row, column) of pixels in cells, each of `shape`; shared, so read only."""
     rows, cols = np.indices(shape) / _CELL_PIXELS
     return rows, cols
 

@@ -66,22 +66,25 @@ def camera_extrinsics(mount: CameraMount, pose: ArrayLike) -> NDArray[np.float64
     p = np.asarray(pose, dtype=np.float64)
     cos, sin = np.cos(p[..., 2]), np.sin(p[..., 2])
     cp, sp = math.cos(mount.pitch), math.sin(mount.pitch)
-    zero, one = np.zeros_like(cos), np.ones_like(cos)
-    # Rows: image right, image down, optical axis, each as a unit vector of the map frame.
-    rotation = np.stack(
-        [
-            np.stack([sin, -cos, zero], axis=-1),
-            np.stack([-sp * cos, -sp * sin, -cp * one], axis=-1),
-            np.stack([cp * cos, cp * sin, -sp * one], axis=-1),
-        ],
-        axis=-2,
-    )
-    eye = np.stack([p[..., 0] + mount.forward * cos, p[..., 1] + mount.forward * sin, mount.height * one], axis=-1)
     transform = np.zeros((*p.shape[:-1], 4, 4))
-    transform[..., :3, :3] = rotation
-    transform[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, eye)
+    # Rows: image right, image down, optical axis, each a unit vector of the map frame.
+    transform[..., 0, 0], transform[..., 0, 1] = sin, -cos
+    transform[..., 1, 0], transform[..., 1, 1], transform[..., 1, 2] = -sp * cos, -sp * sin, -cp
+    transform[..., 2, 0], transform[..., 2, 1], transform[..., 2, 2] = cp * cos, cp * sin, -sp
+    # The camera's place, turned into the optical frame: only `along` and `across` depend on the pose.
+    along, across = p[..., 0] * cos + p[..., 1] * sin + mount.forward, p[..., 0] * sin - p[..., 1] * cos
+    transform[..., 0, 3] = -across
+    transform[..., 1, 3] = sp * along + cp * mount.height
+    transform[..., 2, 3] = sp * mount.height - cp * along
     transform[..., 3, 3] = 1.0
     return transform
+
+
+def _to_optical(points: ArrayLike, pose: ArrayLike, mount: CameraMount) -> NDArray[np.float64]:
+    """Return map points [..., N, 3] in the optical frames of the cameras."""
+    transform = camera_extrinsics(mount, pose)
+    turned = np.asarray(points, dtype=np.float64) @ np.swapaxes(transform[..., :3, :3], -1, -2)
+    return turned + transform[..., None, :3, 3]
 
 
 def project(points: ArrayLike, pose: ArrayLike, mount: CameraMount, size: int = FRAME_SIZE) -> Projection:
@@ -96,12 +99,9 @@ def project(points: ArrayLike, pose: ArrayLike, mount: CameraMount, size: int = 
     Returns:
         Pixels [..., N, 2] and depth [..., N].
     """
-    transform = camera_extrinsics(mount, pose)
     intrinsics = camera_intrinsics(mount, size)
-    # Shape [..., N, 3], optical frame.
-    optical = (
-        np.asarray(points, dtype=np.float64) @ np.swapaxes(transform[..., :3, :3], -1, -2) + transform[..., None, :3, 3]
-    )
+    # Shape [..., N, 3].
+    optical = _to_optical(points, pose, mount)
     depth = optical[..., 2]
     safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
     pixels = optical[..., :2] / safe[..., None] * intrinsics[[0, 1], [0, 1]] + intrinsics[:2, 2]
@@ -120,10 +120,7 @@ def in_view(points: ArrayLike, radius: ArrayLike, pose: ArrayLike, mount: Camera
     Returns:
         [..., N]; false only if no part of the sphere is in the frame.
     """
-    transform = camera_extrinsics(mount, pose)
-    optical = (
-        np.asarray(points, dtype=np.float64) @ np.swapaxes(transform[..., :3, :3], -1, -2) + transform[..., None, :3, 3]
-    )
+    optical = _to_optical(points, pose, mount)
     half = math.radians(mount.fovy) / 2
     reach = np.asarray(radius, dtype=np.float64)
     # A sphere is outside if it lies beyond one of the frame's side planes, or behind.

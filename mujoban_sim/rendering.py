@@ -197,6 +197,7 @@ class FrameRenderer:
         self._targets = np.zeros((batch, max_boxes, 2))
         self._has_target = np.zeros((batch, max_boxes), np.bool_)
         self._ready = np.zeros(batch, np.bool_)
+        self._writing: list[Future[None]] = []
 
     def set_episode(self, row: int, level: Level, seed: int) -> None:
         """Show a level in a row from now on, with the textures of the episode's seed.
@@ -211,7 +212,8 @@ class FrameRenderer:
         if len(targets) > self.max_boxes:
             raise ValueError(f"the level has {len(targets)} targets: expected at most max_boxes = {self.max_boxes}")
         painter = self._painters[row % len(self._painters)]
-        painter.submit(painter.write, row // len(self._painters), level, seed).result()
+        # Drawing waits for it: a painter's jobs run in their order.
+        self._writing.append(painter.submit(painter.write, row // len(self._painters), level, seed))
         self._targets[row, : len(targets)] = cell_to_xy(targets, self.body.cell_size)
         self._has_target[row] = np.arange(self.max_boxes) < len(targets)
         self._ready[row] = True
@@ -244,6 +246,8 @@ class FrameRenderer:
         qpos = np.ascontiguousarray(qpos[index])
         rgba = self._colours(pressed[index], boxes_on_target[index], index)
         rgba[..., 3] = self._visible(qpos, index, camera)
+        while self._writing:
+            self._writing.pop().result()
         frames = np.empty((len(index), self.size, self.size, 3), np.uint8)
         count = len(self._painters)
         jobs = []
