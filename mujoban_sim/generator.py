@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numba import njit
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mujoban_sim.bitboard import NONE, SIDE, SQUARE_STEP, SQUARES, Bits, bit, count, flood, lowest, shift
 from mujoban_sim.grid import DIFFICULTIES, GRID_SIZE
-from mujoban_sim.levels import Level
+from mujoban_sim.levels import Level, LevelBatch
 
 TEST_SEEDS: Final = range(0, 10_000_000)
 """Seeds of what users play and of every evaluation."""
@@ -44,19 +44,6 @@ _STEPS_PER_SIDE: Final = 3.4
 _REVERSE_STATES: Final = 3000
 """States that reverse play visits at most."""
 _TABLE_BITS: Final = 13
-
-
-class LevelBatch(NamedTuple):
-    """Levels as arrays, for vectorised consumers. Shapes: B levels, K boxes, N = `grid.GRID_SIZE`."""
-
-    wall: NDArray[np.bool_]
-    """[B, N, N]."""
-    target: NDArray[np.bool_]
-    """[B, N, N]."""
-    boxes: NDArray[np.int64]
-    """(row, column), sorted, [B, K, 2]."""
-    player: NDArray[np.int64]
-    """(row, column), [B, 2]."""
 
 
 @njit(cache=True, nogil=True)

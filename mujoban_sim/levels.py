@@ -12,7 +12,7 @@ space   floor              ``*``   box on a target
 ``$``   box
 ======  =================  ======  ====================
 
-Shapes: N = `grid.GRID_SIZE`, K boxes.
+Shapes: N = `grid.GRID_SIZE`, K boxes, B levels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +119,33 @@ class Level:
             grid[row, col] = "*" if self.target[row, col] else "$"
         grid[self.player] = "+" if self.target[self.player] else "@"
         return "\n".join("".join(row) for row in grid)
+
+
+class LevelBatch(NamedTuple):
+    """Levels, or states on the way through them, as arrays for batched consumers."""
+
+    wall: NDArray[np.bool_]
+    """[B, N, N]."""
+    target: NDArray[np.bool_]
+    """[B, N, N]."""
+    boxes: NDArray[np.int64]
+    """(row, column), [B, K, 2]; (-1, -1) where a level has fewer than K."""
+    player: NDArray[np.int64]
+    """(row, column), [B, 2]."""
+
+
+def stack_levels(levels: Sequence[Level]) -> LevelBatch:
+    """Return levels as one batch; K is the largest number of boxes."""
+    boxes = np.full((len(levels), max((len(level.boxes) for level in levels), default=0), 2), -1, np.int64)
+    for row, level in zip(boxes, levels, strict=True):
+        row[: len(level.boxes)] = level.boxes
+    shape = (len(levels), GRID_SIZE, GRID_SIZE)
+    return LevelBatch(
+        np.array([level.wall for level in levels], np.bool_).reshape(shape),
+        np.array([level.target for level in levels], np.bool_).reshape(shape),
+        boxes,
+        np.array([level.player for level in levels], np.int64).reshape(-1, 2),
+    )
 
 
 def read_levels(path: str | PathLike[str]) -> list[Level]:
