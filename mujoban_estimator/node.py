@@ -1,0 +1,44 @@
+"""The state estimator's node: o_cam, o_pos -> estimate of s_abst (`python -m mujoban_estimator.node`)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from mujoban_msgs.msg import Episode
+
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.module_node import ModuleNode
+from mujoban_msgs_py.tick_node import Input, Output, run_node
+from mujoban_sim.interfaces import EstimatorInput, GroundTruth
+
+
+class EstimatorNode(ModuleNode):
+    """Publishes `/abstract_state`; parameters as in `ModuleNode`."""
+
+    role = "estimator"
+    inputs = (
+        Input(topics.CAMERA, conversions.frame_from_msg),
+        Input(topics.POSE, conversions.pose_from_msg),
+    )
+
+    def __init__(self, **options: Any) -> None:
+        """Load the module and start listening."""
+        super().__init__(**options)
+        self._publisher = self.create_output(topics.ABSTRACT_STATE)
+
+    def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
+        """Estimate the abstract state of one tick."""
+        frame, pose = inputs[topics.CAMERA.name], inputs[topics.POSE.name]
+        estimate, self.state = self.module.step(EstimatorInput(frame[None], pose[None], truth), self.state)
+        return [Output(self._publisher, conversions.abstract_state_to_msg(episode.header, estimate[0]))]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(EstimatorNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,135 @@
+"""Dead reckoning from proprioception, seen from the instruction in force: inputs of control termination (paper C.4).
+
+Termination has to say whether the robot is within a tenth of a cell of a cell's centre, without being told its pose.
+Velocity and heading are felt, so how far the robot has come since its episode began at a cell's centre can be summed
+up; the camera corrects the drift. Everything is turned so that the instruction points along +x, since
+what completes an instruction does not depend on the compass.
+
+Shapes: B robots, T ticks, P proprioceptive values.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mujoban_sim.bodies import Body
+from mujoban_sim.grid import CONTROL_PERIOD, INSTRUCTION_LIMIT, OFFSETS_XY
+
+FEATURES: Final = 24
+"""Features of a tick beside raw proprioception; see `Odometry.forward`."""
+_BEHIND: Final = 0.2
+"""After a push the robot stands up to half a cell ahead of its cell's centre, never behind it: the cell is rounded
+from this far behind, in cells."""
+
+
+class Track(NamedTuple):
+    """What dead reckoning remembers; lengths in cells."""
+
+    position: Tensor
+    """Since the start of the episode, [B, 2] in the map's axes."""
+    velocity: Tensor
+    """Of the tick before, [B, 2], cells per second."""
+    start: Tensor
+    """Position when the instruction in force was issued, [B, 2]."""
+    origin: Tensor
+    """Centre of the cell from which it counts, [B, 2]."""
+    elapsed: Tensor
+    """Ticks since it was issued, [B]."""
+    direction: Tensor
+    """Unit vector of the instruction in force, [B, 2]; zero for `stay`."""
+    before: Tensor
+    """That of the instruction before it, [B, 2]."""
+
+
+class Odometry:
+    """Turns proprioception into features of progress; has no weights."""
+
+    def __init__(self, body: Body) -> None:
+        """Read a body's layout of proprioception.
+
+        Raises:
+            ValueError: if the body does not feel its heading.
+        """
+        if "steer" not in body.joints:
+            raise ValueError(f"body {body.name} has no joint 'steer': expected one that tells its heading")
+        self.heading = 9 + body.joints.index("steer")
+        self.cell_size = body.cell_size
+
+    def initial(self, batch: int, device: torch.device | str = "cpu") -> Track:
+        """Return the track of robots at the centre of a cell at the start of an episode."""
+        zeros = torch.zeros(batch, 2, device=device)
+        return Track(zeros, zeros, zeros, zeros, torch.zeros(batch, device=device), zeros, zeros)
+
+    def __call__(
+        self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Track
+    ) -> tuple[Tensor, Track]:
+        """Return features [B, T, FEATURES] and the track after the last tick.
+
+        Args:
+            proprio: o_pr, [B, T, P].
+            instruction: A_{t-1}, int64 [B, T].
+            terminated: beta_{t-1}, bool [B, T]; A_{t-1} was issued in the tick before where true.
+            track: before the first tick.
+        """
+        psi = proprio[..., self.heading]
+        cos, sin = psi.cos(), psi.sin()
+        ahead, left = proprio[..., 0] / self.cell_size, proprio[..., 1] / self.cell_size
+        velocity = torch.stack([ahead * cos - left * sin, ahead * sin + left * cos], dim=-1)  # [B, T, 2]
+        offsets = torch.as_tensor(OFFSETS_XY, dtype=proprio.dtype, device=proprio.device)
+        direction = offsets[instruction]
+        rows = []
+        for t in range(proprio.shape[1]):
+            track = _advance(track, velocity[:, t], direction[:, t], terminated[:, t])
+            rows.append(track)
+        tracks = Track(*(torch.stack(parts, dim=1) for parts in zip(*rows, strict=True)))
+        return self._features(proprio, velocity, direction, tracks), track
+
+    def _features(self, proprio: Tensor, velocity: Tensor, direction: Tensor, track: Track) -> Tensor:
+        stay = (direction == 0).all(dim=-1, keepdim=True)
+        psi = proprio[..., self.heading, None]
+        heading = torch.cat([psi.cos(), psi.sin()], dim=-1)
+        target = turn(track.origin + direction - track.position, direction)
+        home = turn(track.origin - track.position, direction)
+        phase = 2 * math.pi * turn(track.position, direction)
+        elapsed = track.elapsed[..., None]
+        columns = [
+            turn(heading, direction),  # 2
+            turn(velocity, direction),  # 2
+            proprio[..., 5:6] / 4,  # 1: yaw rate
+            turn(track.position - track.start, direction).clamp(-2, 2),  # 2
+            target.clamp(-2, 2), (target * 5).clamp(-2, 2),  # 4
+            home.clamp(-2, 2), (home * 5).clamp(-2, 2),  # 4
+            phase.cos(), phase.sin(),  # 4
+            turn(track.before, direction),  # 2
+            elapsed / INSTRUCTION_LIMIT, (elapsed / 20).clamp(max=2.0), stay.to(proprio.dtype),  # 3
+        ]  # fmt: skip
+        return torch.cat(columns, dim=-1)
+
+
+def turn(vector: Tensor, direction: Tensor) -> Tensor:
+    """Return vectors of the map in the frame in which an instruction points along +x; all [..., 2].
+
+    Args:
+        vector: in the axes of the map.
+        direction: unit vector of the instruction; zero for `stay`, whose frame is the map's.
+    """
+    east = direction.new_tensor([1.0, 0.0])
+    axis = torch.where((direction == 0).all(dim=-1, keepdim=True), east, direction)
+    along = (vector * axis).sum(dim=-1)
+    across = vector[..., 1] * axis[..., 0] - vector[..., 0] * axis[..., 1]
+    return torch.stack([along, across], dim=-1)
+
+
+def _advance(track: Track, velocity: Tensor, direction: Tensor, terminated: Tensor) -> Track:
+    """Return the track one tick later; all arguments are of one tick, [B, ...]."""
+    issued = terminated[:, None]
+    start = torch.where(issued, track.position, track.start)
+    before = torch.where(issued, track.direction, track.before)
+    origin = torch.where(issued, torch.round(track.position - _BEHIND * before), track.origin)
+    position = track.position + 0.5 * CONTROL_PERIOD * (track.velocity + velocity)
+    elapsed = torch.where(terminated, torch.zeros_like(track.elapsed), track.elapsed) + 1
+    return Track(position, velocity, start, origin, elapsed, direction, before)

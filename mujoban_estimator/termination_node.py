@@ -1,0 +1,115 @@
+"""The control-termination node: o_cam, o_pr, A_{t-1}, beta_{t-1} -> beta_t.
+
+Run it with `python -m mujoban_estimator.termination_node`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from mujoban_msgs.msg import Episode, Instruction
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
+
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.module_node import ModuleNode
+from mujoban_msgs_py.tick_node import Input, Output, run_node
+from mujoban_sim.interfaces import NO_INSTRUCTION, GroundTruth, TerminationInput
+
+_SETTINGS = ("sample", "threshold", "limit")
+
+
+class TerminationNode(ModuleNode):
+    """Publishes `/termination`.
+
+    Parameters, besides those of `ModuleNode`, all settable while it runs:
+        sample: Whether beta is sampled from its probability, as in the paper.
+        threshold: Probability above which beta is true where it is not sampled.
+        limit: Ticks after which beta is forced.
+    """
+
+    role = "termination"
+    inputs = (
+        Input(topics.CAMERA, conversions.frame_from_msg),
+        Input(topics.PROPRIO, conversions.proprio_from_msg),
+    )
+
+    def __init__(self, **options: Any) -> None:
+        """Load the module and start listening."""
+        super().__init__(**options)
+        self._publisher = self.create_output(topics.TERMINATION)
+        self._terminated = False
+        self._said: dict[int, Instruction] = {}
+        for name in _SETTINGS:
+            setattr(self.module, name, self.declare_parameter(name, getattr(self.module, name)).value)
+        topic = topics.INSTRUCTION
+        self.create_subscription(topic.type, topic.name, self._on_instruction, topic.qos)
+
+    def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
+        """Start the state and forget the instructions of the episode before."""
+        super().begin(episode, inputs)
+        self._terminated = False
+
+    def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
+        """Wait for A_{t-1}, unless this node has only just joined the episode."""
+        joined = self.state is not None and episode.step > 0
+        if joined and not insist and stamp - topics.TICK not in self._said:
+            return None
+        return super().answer(stamp, episode, inputs, insist=insist)
+
+    def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
+        """Classify one tick."""
+        previous = self._previous(conversions.stamp_of(episode)) if episode.step > 0 else None
+        direction = NO_INSTRUCTION if previous is None else previous.direction
+        beta, self.state = self.module.step(
+            TerminationInput(
+                inputs[topics.CAMERA.name][None],
+                inputs[topics.PROPRIO.name][None],
+                np.array([direction], np.int64),
+                np.array([self._terminated]),
+                truth,
+            ),
+            self.state,
+        )
+        self._terminated = bool(beta.terminated[0])
+        message = conversions.termination_to_msg(
+            episode.header,
+            0 if previous is None else previous.sequence,
+            beta.probability[0],
+            beta.terminated[0],
+            beta.timed_out[0],
+        )
+        return [Output(self._publisher, message)]
+
+    def _previous(self, stamp: int) -> Instruction | None:
+        """Return the latest instruction before a stamp."""
+        earlier = [s for s in self._said if s < stamp]
+        return self._said[max(earlier)] if earlier else None
+
+    def _on_instruction(self, message: Instruction) -> None:
+        stamp = conversions.stamp_of(message)
+        self._said = {s: m for s, m in self._said.items() if stamp - 2 * topics.TICK <= s < stamp} | {stamp: message}
+        self.retry()
+
+    def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        result = super()._on_parameters(parameters)
+        if result.successful:
+            for name in _SETTINGS:
+                if self.has_parameter(name):
+                    setattr(self.module, name, self.get_parameter(name).value)
+            for parameter in parameters:
+                if parameter.name in _SETTINGS:
+                    setattr(self.module, parameter.name, parameter.value)
+        return result
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(TerminationNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
