@@ -17,14 +17,16 @@ Shapes: B robots, K boxes, N rows and columns of the grid, M selected rows.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_sim.grid import CELL_SIZE, COMPLETION_TOLERANCE, GRID_SIZE, OFFSETS_RC, Instruction
+from mujoban_sim.grid import CELL_SIZE, COMPLETION_TOLERANCE, Instruction, cell_to_xy
+from mujoban_sim.rules import apply
 
 MAX_BOX_SPEED: Final = 0.3
 """Speed in m/s (of a world with 1 m cells; scaled with the cell) below which a pushed box counts as placed."""
@@ -40,8 +42,10 @@ class GoalKind(IntEnum):
     """No instruction has been issued in the episode yet."""
 
 
-_MOVE, _PUSH, _HOLD, _NONE = (int(k) for k in GoalKind)
-_HALF: Final = (GRID_SIZE - 1) / 2
+_PUSH, _NONE = int(GoalKind.PUSH), int(GoalKind.NONE)
+_ARRAYS: Final = (
+    "direction", "kind", "origin_cell", "goal_cell", "robot_target", "box_index", "box_target", "reached"
+)  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -57,62 +61,6 @@ def is_completed(
     if kind == _PUSH:
         return np.hypot(box_offset[0], box_offset[1]) < tolerance and box_speed < max_box_speed
     return kind != _NONE and np.hypot(robot_offset[0], robot_offset[1]) < tolerance
-
-
-@njit(cache=True, nogil=True)
-def _is_wall(wall: NDArray[np.bool_], row: int, col: int) -> bool:
-    return not (0 <= row < wall.shape[0] and 0 <= col < wall.shape[1]) or wall[row, col]
-
-
-@njit(cache=True, nogil=True)
-def _box_at(box_cell: NDArray[np.int64], row: int, col: int) -> int:
-    for k in range(box_cell.shape[0]):
-        if box_cell[k, 0] == row and box_cell[k, 1] == col:
-            return k
-    return -1
-
-
-@njit(cache=True, nogil=True)
-def _begin(
-    rows: NDArray[np.int64],
-    instruction: NDArray[np.int64],
-    wall: NDArray[np.bool_],
-    agent_cell: NDArray[np.int64],
-    box_cell: NDArray[np.int64],
-    offsets: NDArray[np.int64],
-    cell_size: float,
-    reached: NDArray[np.bool_],
-    goal_cell: NDArray[np.int64],
-    origin_cell: NDArray[np.int64],
-    direction: NDArray[np.int64],
-    kind: NDArray[np.int64],
-    robot_target: NDArray[np.float64],
-    box_index: NDArray[np.int64],
-    box_target: NDArray[np.float64],
-) -> None:
-    for m in range(rows.shape[0]):
-        b = rows[m]
-        row, col = agent_cell[b]
-        if reached[b]:
-            row, col = goal_cell[b]
-        step_row, step_col = offsets[instruction[b]]
-        to_row, to_col = row + step_row, col + step_col
-        box = _box_at(box_cell[b], to_row, to_col)
-        goal = _MOVE
-        if (step_row == 0 and step_col == 0) or _is_wall(wall[b], to_row, to_col):
-            goal = _HOLD
-        elif box >= 0:
-            blocked = _is_wall(wall[b], to_row + step_row, to_col + step_col)
-            goal = _HOLD if blocked or _box_at(box_cell[b], to_row + step_row, to_col + step_col) >= 0 else _PUSH
-        if goal == _HOLD:
-            to_row, to_col = row, col
-        direction[b], kind[b], reached[b] = instruction[b], goal, False
-        origin_cell[b, 0], origin_cell[b, 1] = row, col
-        goal_cell[b, 0], goal_cell[b, 1] = to_row, to_col
-        robot_target[b, 0], robot_target[b, 1] = (to_col - _HALF) * cell_size, (_HALF - to_row) * cell_size
-        box_index[b] = box if goal == _PUSH else 0
-        box_target[b, 0] = robot_target[b, 0] + step_col * cell_size
-        box_target[b, 1] = robot_target[b, 1] - step_row * cell_size
 
 
 @njit(cache=True, nogil=True)
@@ -202,14 +150,30 @@ class GoalTracker:
         Raises:
             ValueError: if an instruction is not one of `Instruction`.
         """
-        chosen = direction[rows]
-        if chosen.size and (chosen.min() < 0 or chosen.max() >= len(Instruction)):
-            raise ValueError(f"instructions {chosen.tolist()}: expected 0 (stay) to {len(Instruction) - 1} (west)")
-        _begin(
-            rows, direction, wall, agent_cell, box_cell, OFFSETS_RC, self.cell_size,
-            self.reached, self.goal_cell, self.origin_cell, self.direction, self.kind,
-            self.robot_target, self.box_index, self.box_target,
-        )  # fmt: skip
+        walls, boxes = wall[rows], box_cell[rows]
+        origin = np.where(self.reached[rows, None], self.goal_cell[rows], agent_cell[rows])
+        # Targets do not matter for where things go.
+        result = apply(walls, walls, boxes, origin, direction[rows])
+        # Shape [M, K].
+        pushed = (result.boxes != boxes).any(-1)
+        index = pushed.argmax(-1)
+        self.direction[rows] = direction[rows]
+        self.kind[rows] = np.where(result.moved, np.where(pushed.any(-1), _PUSH, GoalKind.MOVE), GoalKind.HOLD)
+        self.origin_cell[rows] = origin
+        self.goal_cell[rows] = result.player
+        self.robot_target[rows] = cell_to_xy(result.player, self.cell_size)
+        self.box_index[rows] = index
+        self.box_target[rows] = cell_to_xy(result.boxes[np.arange(len(rows)), index], self.cell_size)
+        self.reached[rows] = False
+
+    def memory(self) -> tuple[NDArray[Any], ...]:
+        """Return a copy of all arrays, for a module that tracks goals itself; the batch is on the first axis."""
+        return tuple(getattr(self, name).copy() for name in _ARRAYS)
+
+    def restore(self, memory: Sequence[NDArray[Any]]) -> None:
+        """Take over a copy of the arrays that `memory` returned."""
+        for name, values in zip(_ARRAYS, memory, strict=True):
+            getattr(self, name)[:] = values
 
     def completed(
         self,

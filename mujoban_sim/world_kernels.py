@@ -14,12 +14,8 @@ from numpy.typing import NDArray
 from mujoban_sim.bodies import INERTIAL_SIZE, UP_AXIS_SIZE
 from mujoban_sim.goals import is_completed
 from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
+from mujoban_sim.rules import BOX_REWARD, SOLVED_REWARD
 from mujoban_sim.scene import BOX_COORDINATES
-
-BOX_ON_REWARD: Final = 1.0
-"""Reward for a box pushed onto a target pad; its negative for one pushed off (paper appendix B)."""
-SOLVED_REWARD: Final = 10.0
-"""Reward for solving the level (paper appendix B)."""
 
 _HALF: Final = (GRID_SIZE - 1) / 2
 
@@ -183,7 +179,7 @@ def update(
         steps[b] += 1
         solved[b] = box_on_target[b].sum() == box_count[b]
         truncated[b] = steps[b] >= time_limit and not solved[b]
-        reward[b] = change * BOX_ON_REWARD + (SOLVED_REWARD if solved[b] else 0.0)
+        reward[b] = change * BOX_REWARD + (SOLVED_REWARD if solved[b] else 0.0)
         episode_return[b] += reward[b]
 
 

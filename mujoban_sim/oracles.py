@@ -1,0 +1,251 @@
+"""Privileged stand-ins for the four modules: perfect sensing, perfect plans, a scripted driver.
+
+They show that the world is sound, isolate a learned module among perfect ones (paper Table 2), and teach.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mujoban_sim.bodies import BALL
+from mujoban_sim.goals import GoalKind, GoalTracker
+from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, OFFSETS_XY, TARGET, WALL, Instruction, xy_to_cell
+from mujoban_sim.interfaces import (
+    Controller,
+    ControllerInput,
+    Estimator,
+    EstimatorInput,
+    GroundTruth,
+    Memory,
+    Planner,
+    Termination,
+    TerminationInput,
+)
+from mujoban_sim.rules import apply
+from mujoban_sim.solver import MAX_NODES, Status, solve
+
+_MAX_PLAN: Final = 1024
+"""Moves of a plan that are remembered; the rest of a longer one is found again when they are done."""
+_WEIGHTS: Final = (1.0, 2.0)
+"""Weights of the searches that are tried in turn."""
+
+
+def _require(truth: GroundTruth | None) -> GroundTruth:
+    if truth is None:
+        raise ValueError("an oracle got no ground truth: expected the simulator's")
+    return truth
+
+
+class OracleEstimator(Estimator):
+    """Returns the true abstract state."""
+
+    privileged = True
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return no memory."""
+        return ()
+
+    def step(self, inputs: EstimatorInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
+        """Return s_abst, [B, N, N, 4]."""
+        return _require(inputs.truth).abstract_state, state
+
+
+class OracleTermination(Termination):
+    """Reports the completion rule of paper C.4."""
+
+    privileged = True
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return no memory."""
+        return ()
+
+    def probability(self, inputs: TerminationInput, memory: Memory) -> tuple[NDArray[np.float32], Memory]:
+        """Return 1 where the instruction in force is completed, else 0, [B]."""
+        return _require(inputs.truth).completed.astype(np.float32), memory
+
+
+class _SokobanState(NamedTuple):
+    """An abstract state as the rules and the solver take it."""
+
+    wall: NDArray[np.bool_]
+    target: NDArray[np.bool_]
+    boxes: NDArray[np.int64]
+    player: NDArray[np.int64]
+
+    @classmethod
+    def from_abstract(cls, state: NDArray[np.float32]) -> _SokobanState:
+        """Read a (possibly estimated) abstract state, [N, N, 4]: cells above 1/2, and the likeliest agent's."""
+        layer = state > 0.5
+        player = np.array(np.unravel_index(state[..., AGENT].argmax(), state.shape[:2]))
+        return cls(layer[..., WALL], layer[..., TARGET], np.argwhere(layer[..., BOX]), player)
+
+    def movable(self) -> NDArray[np.bool_]:
+        """Return where agent and boxes are, [N, N, 2]."""
+        layers = np.zeros((GRID_SIZE, GRID_SIZE, 2), np.bool_)
+        layers[(*self.player, 0)] = True
+        layers[self.boxes[:, 0], self.boxes[:, 1], 1] = True
+        return layers
+
+    def after(self, move: int) -> _SokobanState:
+        """Return the state that a move leads to by the rules."""
+        result = apply(self.wall, self.target, self.boxes, self.player, move)
+        return self._replace(boxes=result.boxes, player=result.player)
+
+
+class OraclePlanner(Planner):
+    """Follows the solver's plan, and plans again when the abstract state is not the one that the plan led to.
+
+    Where there is no plan (the state cannot be solved, is solved, or is no Sokoban state) it says stay. It sees what
+    every planner sees, so it also works on estimates.
+    """
+
+    privileged = True
+
+    def __init__(self, *, max_nodes: int = MAX_NODES) -> None:
+        """Give the optimal search `max_nodes` states, and if it fails a weighted one as many."""
+        self._max_nodes = max_nodes
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return empty plans: moves int8 [B, L], cursor int64 [B], expected agent and boxes bool [B, N, N, 2]."""
+        return (
+            np.zeros((batch, _MAX_PLAN), np.int8),
+            np.zeros(batch, np.int64),
+            np.zeros((batch, GRID_SIZE, GRID_SIZE, 2), np.bool_),
+        )
+
+    def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
+        """Return the next move of each plan, [M], from abstract states [M, N, N, 4]."""
+        plan, cursor, expected = (m.copy() for m in memory)
+        moves = np.zeros(len(plan), np.int64)
+        for m, state in enumerate(abstract_state):
+            grid = _SokobanState.from_abstract(state)
+            if cursor[m] == _MAX_PLAN or not np.array_equal(grid.movable(), expected[m]):
+                plan[m], cursor[m] = self._plan(grid), 0
+            moves[m] = plan[m, cursor[m]]
+            # A plan ends with stay, and there it rests.
+            cursor[m] += moves[m] != Instruction.STAY
+            expected[m] = grid.after(moves[m]).movable()
+        return moves, (plan, cursor, expected)
+
+    def _plan(self, grid: _SokobanState) -> NDArray[np.int8]:
+        """Return the solution's moves, padded with stay, [L]."""
+        plan = np.full(_MAX_PLAN, Instruction.STAY, np.int8)
+        for weight in _WEIGHTS:
+            try:
+                solution = solve(*grid, max_nodes=self._max_nodes, weight=weight)
+            except ValueError:
+                # An estimate with, say, more boxes than targets.
+                break
+            if solution.status != Status.BUDGET:
+                moves = solution.moves[:_MAX_PLAN]
+                plan[: len(moves)] = moves
+                break
+        return plan
+
+
+@dataclass(frozen=True)
+class DrivingGains:
+    """Gains of the scripted driver; lengths in cells, speeds in cells per second, angles in radians."""
+
+    move_speed: float = 1.5
+    push_speed: float = 1.0
+    least_speed: float = 0.15
+    """Speed to which the robot slows down at its goal."""
+    braking: float = 3.0
+    """Speed per cell of distance left."""
+    lane_tolerance: float = 0.12
+    """Distance from the lane beyond which the robot recentres before it drives on."""
+    lane_gain: float = 1.5
+    """Weight of the distance from the lane in the direction to drive in."""
+    look_ahead: float = 0.4
+    turn_limit: float = 0.5
+    """Heading error above which the robot turns on the spot."""
+    roll_feed_forward: float = 0.2
+    roll_gain: float = 0.5
+    steer_gain: float = 1.5
+    steer_damping: float = 0.05
+
+
+class OracleController(Controller):
+    """A scripted driver that knows where everything is: turn, drive along the lane, reverse to recentre.
+
+    The lane of an instruction is the line through its goal in its direction. Off the lane, or when it holds its
+    cell, the robot recentres first, backwards if that is nearer.
+    """
+
+    privileged = True
+
+    def __init__(self, gains: DrivingGains | None = None) -> None:
+        """Drive the ball body with the given gains."""
+        self._gains = gains or DrivingGains()
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return goals of robots without an instruction."""
+        return GoalTracker(batch).memory()
+
+    def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
+        """Return torques, [B, 2], and the goals in force."""
+        truth = _require(inputs.truth)
+        goals = GoalTracker(len(inputs.instruction), cell_size=BALL.cell_size)
+        goals.restore(state)
+        goals.reached[:] = truth.completed
+        issued = np.flatnonzero(inputs.terminated | (goals.kind == GoalKind.NONE))
+        if issued.size:
+            layers = truth.abstract_state
+            agent = layers[..., AGENT].reshape(len(layers), -1).argmax(-1)
+            boxes = xy_to_cell(truth.box_position, BALL.cell_size)
+            boxes[((boxes < 0) | (boxes >= GRID_SIZE)).any(-1)] = -1
+            goals.begin(
+                issued,
+                inputs.instruction,
+                layers[..., WALL] > 0.5,
+                np.stack([agent // GRID_SIZE, agent % GRID_SIZE], -1),
+                boxes,
+            )
+        return drive(goals, truth, self._gains), goals.memory()
+
+
+def drive(goals: GoalTracker, truth: GroundTruth, gains: DrivingGains) -> NDArray[np.float32]:
+    """Return the scripted driver's torques (roll, steer), normalised, [B, 2].
+
+    Args:
+        goals: the instructions in force.
+        truth: where everything is.
+        gains: the driver's gains.
+    """
+    g = gains
+    pose, velocity = truth.pose.astype(np.float64), truth.velocity.astype(np.float64)
+    push = goals.kind == GoalKind.PUSH
+    # Shape [B, 2]; zero where the robot holds its cell.
+    lane = OFFSETS_XY[goals.direction] * (push | (goals.kind == GoalKind.MOVE))[:, None]
+    to_goal = (goals.robot_target - pose[:, :2]) / BALL.cell_size
+    along = (to_goal * lane).sum(-1)
+    aside = to_goal - along[:, None] * lane
+    off_lane = np.linalg.norm(aside, axis=-1)
+    recentre = ~lane.any(-1) | (off_lane > g.lane_tolerance)
+
+    course = np.where(recentre[:, None], aside, aside * g.lane_gain + lane * g.look_ahead)
+    error = _wrap(np.arctan2(course[:, 1], course[:, 0]) - pose[:, 2])
+    backwards = recentre & (np.abs(error) > np.pi / 2)
+    error = np.where(backwards, _wrap(error + np.pi), error)
+
+    box = truth.box_position[np.arange(len(pose)), goals.box_index]
+    box_left = ((goals.box_target - box) / BALL.cell_size * lane).sum(-1)
+    left = np.where(recentre, off_lane, np.maximum(np.where(push, box_left, along), 0.0))
+    speed = np.clip(g.braking * left, g.least_speed, np.where(push, g.push_speed, g.move_speed))
+    speed *= np.clip(np.cos(error), 0.0, 1.0) ** 4 * (np.abs(error) <= g.turn_limit)
+    speed = np.where(backwards, -speed, speed)
+
+    heading = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], -1)
+    forward_speed = (velocity[:, :2] * heading).sum(-1) / BALL.cell_size
+    roll = g.roll_feed_forward * speed + g.roll_gain * (speed - forward_speed)
+    steer = g.steer_gain * error - g.steer_damping * velocity[:, 2]
+    return np.clip(np.stack([roll, steer], -1), -1.0, 1.0).astype(np.float32)
+
+
+def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
