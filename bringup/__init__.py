@@ -1,0 +1,1 @@
+"""Run the whole stack: batched rollout, evaluation, the ROS graph in one or several processes, recording."""

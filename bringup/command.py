@@ -1,0 +1,141 @@
+"""What the commands have in common: options, module selection, and one line on stderr for bad input."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from mujoban_rl.weights import digest
+from mujoban_sim.episodes import Episodes
+from mujoban_sim.grid import DIFFICULTIES
+from mujoban_sim.interfaces import Module
+from mujoban_sim.plugins import LEARNED, ORACLE, ROLES, load_module, shipped_weights
+from mujoban_sim.sense_plan_act import SensePlanAct
+from mujoban_sim.solver import Status, solve_levels
+
+USAGE_ERROR = 2
+"""Exit status of a command whose input was bad."""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that reports an error in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error and leave."""
+        self.exit(USAGE_ERROR, f"{self.prog}: error: {message}\n")
+
+
+def run_command(prog: str, command: Callable[[], int]) -> NoReturn:
+    """Run a command and leave with its exit status; bad input is one line on stderr and status 2."""
+    try:
+        status = command()
+    except (ValueError, OSError) as error:
+        print(f"{prog}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        status = USAGE_ERROR
+    except KeyboardInterrupt:
+        status = 130
+    sys.exit(status)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which module plays a role."""
+
+    role: str
+    source: str = LEARNED
+    weights: Path | None = None
+
+    @classmethod
+    def parse(cls, role: str, text: str) -> Choice:
+        """Read `learned`, `oracle`, a `.safetensors` file or `package.module:Class`."""
+        if text.endswith(".safetensors"):
+            return cls(role, LEARNED, Path(text))
+        return cls(role, text)
+
+    def load(self, device: str = "cpu") -> Module:
+        """Return the module.
+
+        Raises:
+            ValueError: If it cannot be found, or its weights are missing or damaged.
+        """
+        return load_module(self.role, self.source, self.weights, device)
+
+    def identity(self) -> str:
+        """Return the SHA-256 digest of the weights in use, or what stands in for a learned module."""
+        return digest(self.weights or shipped_weights(self.role)) if self.source == LEARNED else self.source
+
+
+@dataclass(frozen=True)
+class Stack:
+    """The four modules that a command plays with."""
+
+    choices: dict[str, Choice] = field(default_factory=lambda: {role: Choice(role) for role in ROLES})
+    device: str = "cpu"
+
+    def policy(self) -> SensePlanAct:
+        """Return the modules composed into one policy."""
+        return SensePlanAct(**{role: choice.load(self.device) for role, choice in self.choices.items()})  # pyright: ignore
+
+    def identities(self) -> dict[str, str]:
+        """Return what identifies each module in a report."""
+        return {role: choice.identity() for role, choice in self.choices.items()}
+
+
+def add_episode_options(parser: argparse.ArgumentParser, *, episodes: int | None = None) -> None:
+    """Add the options that say which episodes are played."""
+    parser.add_argument(
+        "--difficulty", type=int, choices=sorted(DIFFICULTIES), default=max(DIFFICULTIES), help="of generated levels"
+    )
+    parser.add_argument("--episodes", type=int, default=episodes, help="number of episodes")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode; episode i has seed + i")
+    parser.add_argument("--levels", type=Path, metavar="FILE", help="play the levels of a Boxoban text file instead")
+
+
+def add_module_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose the modules."""
+    every = ",".join(ROLES)
+    parser.add_argument("--oracle", default="", metavar="ROLES", help=f"modules to replace by their oracle: {every}")
+    for role in ROLES:
+        parser.add_argument(
+            f"--{role}",
+            default=LEARNED,
+            metavar="WEIGHTS|MODULE:CLASS",
+            help=f"weights (.safetensors) of the learned {role}, or a class of your own to play it",
+        )
+    parser.add_argument("--device", default="cpu", help="device of the learned modules")
+
+
+def episodes_from(arguments: argparse.Namespace) -> Episodes:
+    """Return the episodes that the options ask for; say on stderr which levels of a file are unsolvable."""
+    episodes = Episodes(
+        arguments.episodes, arguments.seed, difficulty=arguments.difficulty, level_file=arguments.levels
+    )
+    if episodes.levels is not None:
+        for index in np.flatnonzero(solve_levels(episodes.levels).status == Status.UNSOLVABLE):
+            print(f"level {index} of {arguments.levels} is unsolvable; it is played all the same", file=sys.stderr)
+    return episodes
+
+
+def stack_from(arguments: argparse.Namespace) -> Stack:
+    """Return the modules that the options ask for.
+
+    Raises:
+        ValueError: If a role of `--oracle` is unknown.
+    """
+    choices = {role: Choice.parse(role, getattr(arguments, role)) for role in ROLES}
+    for role in filter(None, arguments.oracle.split(",")):
+        if role not in ROLES:
+            raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
+        choices[role] = Choice(role, ORACLE)
+    return Stack(choices, arguments.device)
+
+
+def import_from_here(path: Sequence[str] = ("",)) -> None:
+    """Let `package.module:Class` name modules of the working directory, as `python -m` does."""
+    sys.path[:0] = [entry for entry in path if entry not in sys.path]

@@ -1,0 +1,91 @@
+"""Evaluate the stack on many levels in one vectorised rollout: `python bringup/evaluate.py`.
+
+With `--graph` the same episodes run through the ROS graph, one after the other.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from bringup.command import (
+    Parser,
+    add_episode_options,
+    add_module_options,
+    episodes_from,
+    import_from_here,
+    run_command,
+    stack_from,
+)
+from bringup.results import EpisodeResult, report, write_report
+from bringup.rollout import rollout
+from mujoban_sim.episodes import Episodes
+from mujoban_sim.sense_plan_act import SensePlanAct
+from mujoban_sim.world import World
+
+PROG = "evaluate.py"
+
+
+def evaluate(
+    policy: SensePlanAct, episodes: Episodes, *, batch: int = 64, threads: int = 1, progress: bool = False
+) -> list[EpisodeResult]:
+    """Play the episodes in one batched world and return their outcomes.
+
+    Args:
+        policy: The four modules.
+        episodes: Levels and seeds.
+        batch: Rows of the world.
+        threads: Threads of the physics.
+        progress: Whether to show a progress bar on stderr.
+    """
+    world = World(min(batch, len(episodes)), max_boxes=episodes.max_boxes, threads=threads)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not progress) as bar:
+        task = bar.add_task("solved", total=len(episodes))
+        solved = finished = 0
+
+        def on_result(_: int, result: EpisodeResult) -> None:
+            nonlocal solved, finished
+            solved, finished = solved + result.solved, finished + 1
+            bar.update(task, advance=1, description=f"solved {100 * solved / finished:4.1f} %")
+
+        return rollout(policy, world, episodes, on_result=on_result)
+
+
+def main() -> int:
+    """Run the command."""
+    parser = Parser(PROG, description="Evaluate the stack on many levels in one vectorised rollout.")
+    add_episode_options(parser, episodes=256)
+    add_module_options(parser)
+    parser.add_argument("--batch", type=int, default=64, help="episodes that run at the same time")
+    parser.add_argument("--threads", type=int, default=1, help="threads of physics and networks")
+    parser.add_argument("--graph", action="store_true", help="play through the ROS graph instead")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there instead of printing it")
+    arguments = parser.parse_args()
+    import_from_here()
+    episodes, stack = episodes_from(arguments), stack_from(arguments)
+    if arguments.graph:
+        from bringup.stack import play
+
+        outcome = play(stack, episodes)
+        content = report(outcome.results, stack.identities(), ticks_per_second=outcome.ticks_per_second)
+    else:
+        import torch
+
+        torch.set_num_threads(arguments.threads)
+        results = evaluate(
+            stack.policy(), episodes, batch=arguments.batch, threads=arguments.threads, progress=True
+        )
+        content = report(results, stack.identities())
+    if arguments.json is None:
+        print(json.dumps(content, indent=2))
+    else:
+        write_report(content, arguments.json)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(PROG, main)

@@ -1,0 +1,82 @@
+"""What an episode came to, and the report over many of them that the commands print as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from mujoban_rl.stats import wilson_interval
+from mujoban_rl.weights import write_atomically
+
+
+class Failure(StrEnum):
+    """Why an episode was not solved; `bringup.failure` tells which."""
+
+    WRONG_ESTIMATE = "wrong estimate"
+    """The decision that lost the level, or most of the last ones, rested on a wrong abstract state."""
+    PLANNER_DEAD_END = "planner dead end"
+    """On a right estimate the planner made the level unsolvable, or ran in a loop."""
+    CONTROLLER_TIME_OUT = "controller time-out"
+    """Instructions ran into their time limit."""
+    MISEXECUTION = "misexecution"
+    """A right instruction led to another state than the rules say, and that state is unsolvable."""
+    TIME_LIMIT = "time limit"
+    """None of these: the episode's time ran out while the level could still be solved."""
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeResult:
+    """Outcome of one episode."""
+
+    seed: int
+    solved: bool
+    episode_return: float
+    steps: int
+    instructions: int
+    """Instructions issued."""
+    time_outs: int
+    """Instructions that ran into their time limit."""
+    wrong_estimates: int
+    """Instructions that were decided on a wrong abstract state."""
+    failure: Failure | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of a report's `episodes` list."""
+        entry = asdict(self)
+        entry["return"] = entry.pop("episode_return")
+        entry["failure"] = None if self.failure is None else str(self.failure)
+        return entry
+
+
+def report(results: Sequence[EpisodeResult], weights: Mapping[str, str], **extra: Any) -> dict[str, Any]:
+    """Return the report of an evaluation.
+
+    Args:
+        results: The episodes, at least one.
+        weights: Name of each module -> digest of its weights, or the class that stands in for it.
+        **extra: Further entries, e.g. `ticks_per_second`.
+    """
+    if not results:
+        raise ValueError("a report needs at least one finished episode")
+    solved = sum(r.solved for r in results)
+    failures = Counter(str(r.failure) for r in results if r.failure is not None)
+    return {
+        "success_rate": solved / len(results),
+        "success_interval": [float(bound) for bound in wilson_interval(solved, len(results))],
+        "mean_return": sum(r.episode_return for r in results) / len(results),
+        "mean_steps": sum(r.steps for r in results) / len(results),
+        "failures": dict(failures.most_common()),
+        **extra,
+        "weights": dict(weights),
+        "episodes": [r.to_json() for r in results],
+    }
+
+
+def write_report(content: Mapping[str, Any], path: Path) -> None:
+    """Write a report as JSON, whole or not at all."""
+    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())

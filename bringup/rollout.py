@@ -1,0 +1,168 @@
+"""Batched rollout of a policy in one process: the twin of the ROS graph, for evaluation and data collection.
+
+Shapes: B rows of the world, M <= B rows in which an episode is still running.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bringup.failure import EpisodeLog
+from bringup.results import EpisodeResult
+from mujoban_sim.interfaces import GroundTruth, Observation, renew_rows
+from mujoban_sim.sense_plan_act import Decision, SensePlanAct
+from mujoban_sim.world import EpisodeSpec, World
+
+Tree = TypeVar("Tree")
+
+
+class Tick(NamedTuple):
+    """One tick of the M rows in which an episode runs."""
+
+    rows: NDArray[np.int64]
+    """Rows of the world, [M]."""
+    episode: NDArray[np.int64]
+    """Index of the episode that runs in each of these rows, [M]."""
+    step: NDArray[np.int64]
+    """Number of this tick within its episode, from 0, [M]."""
+    observation: Observation
+    truth: GroundTruth
+    decision: Decision
+    reward: NDArray[np.float32]
+    """Reward for the torque of this tick, [M]."""
+    episode_return: NDArray[np.float32]
+    """Sum of the rewards, that of this tick included, [M]."""
+    solved: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    """Whether the episode's time ran out with this tick, [M]."""
+
+
+def select(tree: Tree, rows: NDArray[np.int64]) -> Tree:
+    """Return the given batch rows of every array in any nesting of tuples and NamedTuples."""
+    if isinstance(tree, tuple):
+        parts: list[Any] = [select(part, rows) for part in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)  # pyright: ignore
+    return tree[rows]  # pyright: ignore
+
+
+def ticks(policy: SensePlanAct, world: World, episodes: Sequence[EpisodeSpec]) -> Iterator[Tick]:
+    """Play every episode once and yield each tick; a row takes the next episode as soon as its own has ended.
+
+    Rows without a further episode leave the policy's batch, so that the last, long episodes cost no more
+    than they must. Frames are rendered only if a module looks at them.
+    """
+    if not episodes:
+        return
+    waiting = iter(range(world.batch, len(episodes)))
+    # A world without an episode in a row cannot step: spare rows stand idle in the first one.
+    world.reset(np.arange(world.batch), [episodes[i if i < len(episodes) else 0] for i in range(world.batch)])
+    rows = np.arange(min(world.batch, len(episodes)))
+    episode = rows.copy()
+    step = np.zeros(len(rows), np.int64)
+    seeds = np.array([episodes[i].seed for i in episode], np.int64)
+    state = policy.initial_state(seeds)
+    camera = needs_camera(policy)
+    torque = np.zeros((world.batch, world.body.action_size), np.float32)
+    instruction = np.zeros(world.batch, np.int64)
+    issued = np.zeros(world.batch, np.bool_)
+    while True:
+        observation, truth = observe(world, rows, camera=camera), select(world.truth(), rows)
+        decision, state = policy.step(observation, truth, state)
+        torque[:], issued[:] = 0.0, False
+        torque[rows], instruction[rows], issued[rows] = decision.torque, decision.instruction, decision.issued
+        world.instruct(instruction, issued)
+        world.step(torque)
+        solved, truncated = world.solved[rows], world.truncated[rows]
+        yield Tick(
+            rows, episode, step, observation, truth, decision,
+            world.reward[rows], world.episode_return[rows], solved, truncated,
+        )
+        step = step + 1
+        ended = solved | truncated
+        if not ended.any():
+            continue
+        episode, finished = episode.copy(), np.zeros(len(rows), np.bool_)
+        for m in np.flatnonzero(ended):
+            following = next(waiting, None)
+            finished[m] = following is None
+            episode[m] = -1 if following is None else following
+        renewed = ended & ~finished
+        if renewed.any():
+            world.reset(rows[renewed], [episodes[i] for i in episode[renewed]])
+            seeds[renewed] = [episodes[i].seed for i in episode[renewed]]
+            state = renew_rows(state, policy.initial_state(seeds), renewed)
+            step[renewed] = 0
+        kept = np.flatnonzero(~finished)
+        if kept.size == 0:
+            return
+        if kept.size < len(rows):
+            rows, episode, step, seeds, state = select((rows, episode, step, seeds, state), kept)
+
+
+def rollout(
+    policy: SensePlanAct,
+    world: World,
+    episodes: Sequence[EpisodeSpec],
+    *,
+    on_result: Callable[[int, EpisodeResult], None] | None = None,
+) -> list[EpisodeResult]:
+    """Play every episode once and return the outcomes in the order of `episodes`.
+
+    Args:
+        policy: The four modules.
+        world: Its rows are all reset; their number is the batch.
+        episodes: Levels and seeds.
+        on_result: Called with the index of an episode and its outcome as soon as it has ended.
+    """
+    judge = Judge(episodes)
+    results: dict[int, EpisodeResult] = {}
+    for tick in ticks(policy, world, episodes):
+        for index, result in judge.observe(tick):
+            results[index] = result
+            if on_result is not None:
+                on_result(index, result)
+    return [results[i] for i in range(len(episodes))]
+
+
+class Judge:
+    """Turns ticks into outcomes of episodes."""
+
+    def __init__(self, episodes: Sequence[EpisodeSpec]) -> None:
+        """Judge the ticks of the given episodes."""
+        self._episodes = episodes
+        self._logs: dict[int, EpisodeLog] = {}
+
+    def observe(self, tick: Tick) -> list[tuple[int, EpisodeResult]]:
+        """Note one tick; return the index and outcome of every episode that ended with it."""
+        said = tick.decision
+        for m in np.flatnonzero(said.issued):
+            index = int(tick.episode[m])
+            log = self._logs.setdefault(index, EpisodeLog(self._episodes[index].seed))
+            log.decided(
+                tick.truth.abstract_state[m], said.abstract_state[m], said.instruction[m], said.termination.timed_out[m]
+            )
+        results = []
+        for m in np.flatnonzero(tick.solved | tick.truncated):
+            index = int(tick.episode[m])
+            log = self._logs.pop(index)
+            results.append(
+                (index, log.result(
+                    solved=tick.solved[m], steps=tick.step[m] + 1, episode_return=tick.episode_return[m]
+                ))
+            )
+        return results
+
+
+def needs_camera(policy: SensePlanAct) -> bool:
+    """Tell whether any module looks at frames: oracles go by the ground truth."""
+    return not all(m.privileged for m in (policy.estimator, policy.termination, policy.controller))
+
+
+def observe(world: World, rows: NDArray[np.int64], *, camera: bool = True) -> Observation:
+    """Return what the robots in the given rows perceive; without `camera` the frames are empty, [M, 0, 0, 3]."""
+    frame = world.render("first_person", rows=rows) if camera else np.zeros((len(rows), 0, 0, 3), np.uint8)
+    return Observation(frame, world.proprio[rows], world.pose[rows])
