@@ -59,27 +59,23 @@ _MIN_CONTRAST: Final = 0.25
 """Least distance in RGB between the colours of walls and floor."""
 
 
-@cache
-def _interpolation(size: int, count: int) -> NDArray[np.float64]:
-    """Return the weights that spread `count` periodic lattice values linearly over `size` pixels, [size, count]."""
-    place = np.arange(size) * count / size
-    first = place.astype(int)
-    weights = np.zeros((size, count))
-    rows = np.arange(size)
-    weights[rows, first] += 1.0 - (place - first)
-    weights[rows, (first + 1) % count] += place - first
-    return weights
+def _stretch(values: Pattern, factor: int) -> Pattern:
+    """Interpolate periodic lattice values linearly along the first axis, [L, M] -> [factor L, M]."""
+    weight = (np.arange(factor) / factor)[:, None]
+    following = np.roll(values, -1, axis=0)
+    return (values[:, None] * (1.0 - weight) + following[:, None] * weight).reshape(-1, values.shape[1])
 
 
 def _fractal_noise(rng: np.random.Generator, shape: tuple[int, int], octaves: int = 5) -> Pattern:
-    """Value noise in [0, 1], periodic along both axes."""
-    total = np.zeros(shape)
+    """Value noise in [0, 1], periodic with a cell along both axes; `shape` is at most a cell."""
+    total = np.zeros((_CELL_PIXELS, _CELL_PIXELS))
     for octave in range(octaves):
         count = 4 << octave
+        factor = _CELL_PIXELS // count
         lattice = 0.55**octave * rng.random((count, count))
-        total += _interpolation(shape[0], count) @ lattice @ _interpolation(shape[1], count).T
+        total += _stretch(_stretch(lattice, factor).T, factor).T
     low, high = total.min(), total.max()
-    return (total - low) / (high - low)
+    return ((total - low) / (high - low))[: shape[0], : shape[1]]
 
 
 @cache
@@ -186,11 +182,11 @@ def _draw_colour(rng: np.random.Generator) -> Colour:
     return np.array(colorsys.hsv_to_rgb(h, rng.uniform(*saturation), rng.uniform(*value)))
 
 
-def _paint(rng: np.random.Generator, colour: Colour, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return a texture around a colour, [height, width, 3]."""
+def _paint(rng: np.random.Generator, colour: Colour, grit: Pattern) -> NDArray[np.float64]:
+    """Return a texture around a colour, roughened by `grit`, [height, width, 3]."""
+    shape = (grit.shape[0], grit.shape[1])
     pattern = PATTERNS[int(rng.integers(len(PATTERNS)))](rng, shape)
     second = np.clip(colour * rng.choice([rng.uniform(0.55, 0.8), rng.uniform(1.2, 1.4)]), 0.0, 0.92)
-    grit = 1.0 + 0.08 * (_fractal_noise(rng, shape) - 0.5)
     return (colour + pattern[..., None] * (second - colour)) * grit[..., None]
 
 
@@ -218,12 +214,12 @@ def draw_atlas(seed: int) -> Image:
     wall, floor = _draw_colour(rng), _draw_colour(rng)
     while np.linalg.norm(wall - floor) < _MIN_CONTRAST:
         floor = _draw_colour(rng)
-    shapes = {band: (rows, _CELL_PIXELS) for band, rows in _BAND_PIXELS.items()}
+    grit = 1.0 + 0.08 * (_fractal_noise(rng, (_CELL_PIXELS, _CELL_PIXELS)) - 0.5)
     bands = {
-        "side": _paint(rng, wall, shapes["side"]),
-        "top": _paint(rng, np.clip(wall * rng.choice([0.75, 1.2]), 0.0, 0.9), shapes["top"]),
-        "floor": _paint(rng, floor, shapes["floor"]),
-        "peg": np.full((*shapes["peg"], 3), 0.45),
+        "side": _paint(rng, wall, grit[: _BAND_PIXELS["side"]]),
+        "top": _paint(rng, np.clip(wall * rng.choice([0.75, 1.2]), 0.0, 0.9), grit),
+        "floor": _paint(rng, floor, grit),
+        "peg": np.full((_BAND_PIXELS["peg"], _CELL_PIXELS, 3), 0.45),
     }
     border = np.clip(floor * (0.55 if floor.mean() > 0.4 else 1.6), 0.0, 0.9)
     _outline(bands["floor"], border, 4)
