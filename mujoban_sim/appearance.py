@@ -55,8 +55,8 @@ _PALETTE: Final = (
     ((165.0, 200.0), (0.15, 0.55), (0.35, 0.75)),
     ((265.0, 315.0), (0.12, 0.40), (0.35, 0.75)),
 )
-_MIN_CONTRAST: Final = 0.25
-"""Least distance in RGB between the colours of walls and floor."""
+_MIN_CONTRAST: Final = 0.2
+"""Least distance in RGB between the mean colours of walls and floor."""
 
 
 def _stretch(values: Pattern, factor: int) -> Pattern:
@@ -226,6 +226,11 @@ def draw_atlas(seed: int) -> Image:
     _outline(bands["top"], np.clip(0.75 * bands["top"].mean(axis=(0, 1)), 0.0, 1.0), 2)
     rows = [np.pad(bands[b], ((_GUTTER, _GUTTER), (0, 0), (0, 0)), mode="wrap") for b in BANDS]
     return np.rint(255 * np.clip(np.concatenate(rows), 0.0, 1.0)).astype(np.uint8)
+
+
+def _mean(image: NDArray[np.float64]) -> Colour:
+    """Return an image's mean colour, [3]."""
+    return image.mean(axis=(0, 1))
 
 
 def _outline(image: NDArray[np.float64], colour: Colour, width: int) -> None:
