@@ -1,0 +1,366 @@
+"""NumPy <-> message for every topic of the graph.
+
+A function `x_to_msg` makes a message and `x_from_msg` reads one. Both check what passes: wrong shape, encoding or
+size and values that are not finite raise `ConversionError`, so that nothing bad enters the graph or leaves it.
+The readers take what rclpy delivers and what `rosbags` deserialises alike. Round trips are exact.
+
+Array fields are filled with `array.array`: the setters of ROS messages are about 1,000 times slower with anything
+else. Scalars become Python scalars: a NumPy scalar in a message is silently corrupted.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Quaternion, TwistStamped, Vector3
+from mujoban_msgs.msg import AbstractState, Episode, Instruction, Proprioception, Termination
+from numpy.typing import ArrayLike, NDArray
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import Header
+
+from mujoban_sim.camera import FRAME_SIZE
+from mujoban_sim.grid import CHANNELS, GRID_SIZE
+from mujoban_sim.grid import Instruction as Direction
+
+ENCODING: Final = "rgb8"
+_SECOND: Final = 1_000_000_000
+_INERTIAL: Final = ("linear_velocity", "angular_velocity", "linear_acceleration")
+
+
+class ConversionError(ValueError):
+    """A message or an array is not what its topic carries."""
+
+
+# Time
+
+
+def time_to_msg(stamp: int) -> Time:
+    """Return a time given in nanoseconds."""
+    return Time(sec=stamp // _SECOND, nanosec=stamp % _SECOND)
+
+
+def time_from_msg(message: Any) -> int:
+    """Return a time in nanoseconds."""
+    return message.sec * _SECOND + message.nanosec
+
+
+def header(stamp: int, frame_id: str = "") -> Header:
+    """Return a header for a stamp in nanoseconds."""
+    return Header(stamp=time_to_msg(stamp), frame_id=frame_id)
+
+
+def stamp_of(message: Any) -> int:
+    """Return the stamp of a message with a header, of a header or of a clock, in nanoseconds."""
+    stamped = getattr(message, "header", message)
+    return time_from_msg(stamped.stamp if hasattr(stamped, "stamp") else stamped.clock)
+
+
+def clock_to_msg(stamp: int) -> Clock:
+    """Return t."""
+    return Clock(clock=time_to_msg(stamp))
+
+
+# Observations
+
+
+def frame_to_msg(header: Header, frame: NDArray[np.uint8]) -> Image:
+    """Return an image of RGB pixels, uint8 [H, W, 3]."""
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise ConversionError(f"frame must be uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
+    height, width, _ = frame.shape
+    return Image(
+        header=header, height=height, width=width, encoding=ENCODING, step=3 * width, data=array("B", frame.tobytes())
+    )
+
+
+def frame_from_msg(message: Any, size: int | None = FRAME_SIZE) -> NDArray[np.uint8]:
+    """Return the pixels of an rgb8 image, [H, W, 3]; H = W = `size` unless that is None."""
+    if message.encoding != ENCODING:
+        raise ConversionError(f"image encoding must be {ENCODING!r}, got {message.encoding!r}")
+    height, width, step = message.height, message.width, message.step
+    if size is not None and (height, width) != (size, size):
+        raise ConversionError(f"image must be {size}x{size} pixels, got {width}x{height}")
+    data = np.frombuffer(message.data, np.uint8)
+    if step < 3 * width or data.size != step * height:
+        raise ConversionError(
+            f"image of {width}x{height} pixels with rows of {step} bytes must have {step * height} bytes "
+            f"and at least {3 * width} to the row, got {data.size}"
+        )
+    return data.reshape(height, step)[:, : 3 * width].reshape(height, width, 3)
+
+
+def camera_info_to_msg(header: Header, intrinsics: ArrayLike, size: int = FRAME_SIZE) -> CameraInfo:
+    """Return the calibration of a square pinhole camera with intrinsic matrix K, [3, 3]."""
+    k = _finite("intrinsics", intrinsics, (3, 3), np.float64)
+    projection = np.hstack([k, np.zeros((3, 1))])
+    return CameraInfo(
+        header=header,
+        height=size,
+        width=size,
+        distortion_model="plumb_bob",
+        d=array("d", [0.0] * 5),
+        k=k.ravel(),
+        r=np.eye(3).ravel(),
+        p=projection.ravel(),
+    )
+
+
+def camera_info_from_msg(message: Any) -> NDArray[np.float64]:
+    """Return the intrinsic matrix K, [3, 3]."""
+    return _finite("k", message.k, (9,), np.float64).reshape(3, 3)
+
+
+def proprio_to_msg(header: Header, proprio: ArrayLike, joints: Sequence[str]) -> Proprioception:
+    """Return o_pr, [P], in the layout of `mujoban_sim.bodies.Body`, of a body with these joints."""
+    count = len(joints)
+    values = _finite("proprio", proprio, (12 + 2 * count,), np.float64).tolist()
+    linear, angular, acceleration = (_vector(values[i : i + 3]) for i in (0, 3, 6))
+    return Proprioception(
+        header=header,
+        name=list(joints),
+        position=array("d", values[9 : 9 + count]),
+        velocity=array("d", values[9 + count : 9 + 2 * count]),
+        linear_velocity=linear,
+        angular_velocity=angular,
+        linear_acceleration=acceleration,
+        world_z_axis=_vector(values[-3:]),
+    )
+
+
+def proprio_from_msg(message: Any) -> NDArray[np.float32]:
+    """Return o_pr, [P], in the layout of `mujoban_sim.bodies.Body`."""
+    count = len(message.name)
+    if not len(message.position) == len(message.velocity) == count:
+        raise ConversionError(
+            f"proprioception of {count} joints must have as many positions and velocities, "
+            f"got {len(message.position)} and {len(message.velocity)}"
+        )
+    values = [c for field in _INERTIAL for v in (getattr(message, field),) for c in (v.x, v.y, v.z)]
+    axis = message.world_z_axis
+    values += [*message.position, *message.velocity, axis.x, axis.y, axis.z]
+    return _finite("proprioception", values, (12 + 2 * count,), np.float32)
+
+
+def pose_to_msg(header: Header, pose: ArrayLike) -> PoseStamped:
+    """Return a pose (x [m], y [m], psi [rad]), [3]; psi in [-pi, pi]."""
+    x, y, yaw = _finite("pose", pose, (3,), np.float64).tolist()
+    orientation = Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+    return PoseStamped(header=header, pose=Pose(position=Point(x=x, y=y), orientation=orientation))
+
+
+def pose_from_msg(message: Any) -> NDArray[np.float32]:
+    """Return (x [m], y [m], psi [rad]), [3]; psi in [-pi, pi]."""
+    p, q = message.pose.position, message.pose.orientation
+    norm = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w
+    if not abs(norm - 1.0) < 1e-3:
+        raise ConversionError(f"orientation must be a unit quaternion, got ({q.x}, {q.y}, {q.z}, {q.w})")
+    yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
+    return _finite("pose", (p.x, p.y, yaw), (3,), np.float32)
+
+
+# What the modules say
+
+
+def abstract_state_to_msg(header: Header, state: NDArray[np.float32]) -> AbstractState:
+    """Return s_abst or an estimate of it, probabilities [rows, columns, 4]."""
+    if state.ndim != 3 or state.shape[2] != len(CHANNELS):
+        raise ConversionError(f"abstract state must be [rows, columns, {len(CHANNELS)}], got {list(state.shape)}")
+    _check_probability("abstract state", state)
+    # Shape [4, rows, columns].
+    layers = np.moveaxis(state, 2, 0).astype(np.float32)
+    fields = {name: array("f", layer.tobytes()) for name, layer in zip(CHANNELS, layers, strict=True)}
+    return AbstractState(header=header, rows=state.shape[0], cols=state.shape[1], **fields)
+
+
+def abstract_state_from_msg(message: Any, size: int | None = GRID_SIZE) -> NDArray[np.float32]:
+    """Return probabilities [rows, columns, 4]; rows = columns = `size` unless that is None."""
+    rows, cols = message.rows, message.cols
+    if size is not None and (rows, cols) != (size, size):
+        raise ConversionError(f"abstract state must have {size}x{size} cells, got {rows}x{cols}")
+    state = np.empty((rows, cols, len(CHANNELS)), np.float32)
+    for channel, name in enumerate(CHANNELS):
+        layer = np.frombuffer(getattr(message, name), np.float32)
+        if layer.size != rows * cols:
+            raise ConversionError(f"layer {name!r} of {rows}x{cols} cells must have {rows * cols}, got {layer.size}")
+        state[..., channel] = layer.reshape(rows, cols)
+    _check_probability("abstract state", state)
+    return state
+
+
+class InstructionReading(NamedTuple):
+    """A, as read from a message."""
+
+    sequence: int
+    direction: int
+
+
+def instruction_to_msg(header: Header, sequence: int, direction: int) -> Instruction:
+    """Return A and its number in the episode."""
+    return Instruction(header=header, sequence=int(sequence), direction=_direction(direction))
+
+
+def instruction_from_msg(message: Any) -> InstructionReading:
+    """Return A and its number in the episode."""
+    return InstructionReading(message.sequence, _direction(message.direction))
+
+
+class TerminationReading(NamedTuple):
+    """beta, as read from a message."""
+
+    sequence: int
+    probability: float
+    terminated: bool
+    timed_out: bool
+
+
+def termination_to_msg(
+    header: Header, sequence: int, probability: float, terminated: bool, timed_out: bool = False
+) -> Termination:
+    """Return beta, which is about the instruction of number `sequence`."""
+    return Termination(
+        header=header,
+        sequence=int(sequence),
+        probability=_probability(probability),
+        terminated=bool(terminated),
+        timed_out=bool(timed_out),
+    )
+
+
+def termination_from_msg(message: Any) -> TerminationReading:
+    """Return beta, its probability and what it is about."""
+    probability = _probability(message.probability)
+    return TerminationReading(message.sequence, probability, bool(message.terminated), bool(message.timed_out))
+
+
+def torque_to_msg(header: Header, torque: ArrayLike, joints: Sequence[str] = ()) -> JointState:
+    """Return torques normalised to [-1, 1], [U]."""
+    values = _torque(torque, None).astype(np.float64)
+    return JointState(header=header, name=list(joints), effort=array("d", values.tobytes()))
+
+
+def torque_from_msg(message: Any, size: int | None = None) -> NDArray[np.float32]:
+    """Return torques normalised to [-1, 1], [U]; U = `size` unless that is None."""
+    return _torque(message.effort, size)
+
+
+# Ground truth
+
+
+def twist_to_msg(header: Header, velocity: ArrayLike) -> TwistStamped:
+    """Return (vx [m/s], vy [m/s], yaw rate [rad/s]) in the map frame, [3]."""
+    vx, vy, rate = _finite("velocity", velocity, (3,), np.float64).tolist()
+    message = TwistStamped(header=header)
+    message.twist.linear.x, message.twist.linear.y, message.twist.angular.z = vx, vy, rate
+    return message
+
+
+def twist_from_msg(message: Any) -> NDArray[np.float32]:
+    """Return (vx [m/s], vy [m/s], yaw rate [rad/s]) in the map frame, [3]."""
+    linear, angular = message.twist.linear, message.twist.angular
+    return _finite("velocity", (linear.x, linear.y, angular.z), (3,), np.float32)
+
+
+def boxes_to_msg(header: Header, position: ArrayLike) -> PoseArray:
+    """Return o_box, box centres in the map frame [m], [K, 2]; boxes never turn."""
+    centres = _finite("box positions", position, (None, 2), np.float64).tolist()
+    return PoseArray(header=header, poses=[Pose(position=Point(x=x, y=y)) for x, y in centres])
+
+
+def boxes_from_msg(message: Any) -> NDArray[np.float32]:
+    """Return o_box, box centres in the map frame [m], [K, 2]."""
+    centres = np.array([(p.position.x, p.position.y) for p in message.poses], np.float32).reshape(-1, 2)
+    return _finite("box positions", centres, (None, 2), np.float32)
+
+
+class EpisodeReading(NamedTuple):
+    """Start, progress and end of an episode; the fields are those of `mujoban_msgs/msg/Episode`."""
+
+    episode: int
+    seed: int
+    difficulty: int
+    level: str
+    step: int
+    reward: float
+    episode_return: float
+    solved: bool
+    terminated: bool
+    truncated: bool
+    boxes_on_target: int
+
+
+def episode_to_msg(header: Header, reading: EpisodeReading) -> Episode:
+    """Return the state of an episode."""
+    reward, total = _finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float64).tolist()
+    return Episode(
+        header=header,
+        episode=int(reading.episode),
+        seed=int(reading.seed),
+        difficulty=int(reading.difficulty),
+        level=reading.level,
+        step=int(reading.step),
+        reward=reward,
+        episode_return=total,
+        solved=bool(reading.solved),
+        terminated=bool(reading.terminated),
+        truncated=bool(reading.truncated),
+        boxes_on_target=int(reading.boxes_on_target),
+    )
+
+
+def episode_from_msg(message: Any) -> EpisodeReading:
+    """Return the state of an episode."""
+    return EpisodeReading(*(getattr(message, name) for name in EpisodeReading._fields))
+
+
+# Checks
+
+
+def _finite(what: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
+    """Return values as an array after a check of shape (None: any length) and finiteness."""
+    result = np.asarray(values, dtype)
+    if len(result.shape) != len(shape) or any(
+        want not in (None, have) for want, have in zip(shape, result.shape, strict=True)
+    ):
+        expected = ", ".join("any" if n is None else str(n) for n in shape)
+        raise ConversionError(f"{what} must have shape [{expected}], got {list(result.shape)}")
+    if not np.isfinite(result).all():
+        raise ConversionError(f"{what} must be finite, got {result.tolist()}")
+    return result
+
+
+def _torque(values: ArrayLike, size: int | None) -> NDArray[np.float32]:
+    torque = _finite("torque", values, (size,), np.float32)
+    if torque.size and np.abs(torque).max() > 1.0:
+        raise ConversionError(f"torque must lie in [-1, 1], got {torque.tolist()}")
+    return torque
+
+
+def _check_probability(what: str, values: NDArray[np.float32]) -> None:
+    # Written so that NaN fails as well.
+    if values.size and not (values.min() >= 0.0 and values.max() <= 1.0):
+        raise ConversionError(f"{what} must hold probabilities in [0, 1], got {values.min()} to {values.max()}")
+
+
+def _probability(value: float) -> float:
+    probability = float(value)
+    if not 0.0 <= probability <= 1.0:
+        raise ConversionError(f"probability must lie in [0, 1], got {probability}")
+    return probability
+
+
+def _direction(value: int) -> int:
+    direction = int(value)
+    if not 0 <= direction < len(Direction):
+        names = ", ".join(f"{d.value} ({d.name})" for d in Direction)
+        raise ConversionError(f"direction must be one of {names}, got {direction}")
+    return direction
+
+
+def _vector(values: Sequence[float]) -> Vector3:
+    return Vector3(x=values[0], y=values[1], z=values[2])

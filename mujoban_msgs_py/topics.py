@@ -1,0 +1,105 @@
+"""The one place for the graph's topics: names, types and QoS, and which symbol of the paper each carries.
+
+All messages of a tick carry the same stamp: simulated time, which goes on over episodes, in steps of `TICK`.
+rclpy is imported only when a QoS profile is asked for, so that readers of bags can do without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+from geometry_msgs.msg import PoseArray, PoseStamped, TwistStamped
+from mujoban_msgs.msg import AbstractState, Episode, Instruction, Proprioception, Termination
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import Header
+
+from mujoban_sim.grid import CONTROL_PERIOD
+
+if TYPE_CHECKING:
+    from rclpy.qos import QoSProfile
+
+TICK: Final = round(CONTROL_PERIOD * 1e9)
+"""Nanoseconds of simulated time between two ticks."""
+QUEUE_DEPTH: Final = 64
+"""Messages kept for a slow reader: 3 s at 20 Hz. In lockstep a node is never more than a few ticks behind."""
+LATCHED_DEPTH: Final = 8
+"""Messages that a late joiner of a latched topic receives at most; the last one is the latest."""
+
+MAP_FRAME: Final = "map"
+CAMERA_FRAME: Final = "camera"
+"""Optical frame of the robot's camera: x right, y down, z forward."""
+TOP_CAMERA_FRAME: Final = "camera_top"
+BODY_FRAME: Final = "robot"
+
+
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """A topic of the graph."""
+
+    name: str
+    type: type[Any]
+    latched: bool = False
+    """Whether those who join late receive the latest message."""
+
+    @property
+    def type_name(self) -> str:
+        """The type as ROS writes it, such as `sensor_msgs/msg/Image`."""
+        return f"{self.type.__module__.split('.')[0]}/msg/{self.type.__name__}"
+
+    @cached_property
+    def qos(self) -> QoSProfile:
+        """Reliable, and deep enough that nothing is lost in lockstep."""
+        from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+        return QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=LATCHED_DEPTH if self.latched else QUEUE_DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE,
+        )
+
+
+CAMERA: Final = Topic("/camera/image_raw", Image)
+"""o_cam, rgb8."""
+CAMERA_INFO: Final = Topic("/camera/camera_info", CameraInfo)
+PROPRIO: Final = Topic("/proprio", Proprioception)
+"""o_pr."""
+POSE: Final = Topic("/pose", PoseStamped)
+"""o_pos = (x, y, psi) in `MAP_FRAME`."""
+EPISODE: Final = Topic("/episode", Episode, latched=True)
+"""Start, reward, return and end of the episode."""
+CLOCK: Final = Topic("/clock", Clock)
+"""t."""
+ABSTRACT_STATE: Final = Topic("/abstract_state", AbstractState)
+"""The estimate of s_abst."""
+TERMINATION: Final = Topic("/termination", Termination)
+"""beta."""
+INSTRUCTION: Final = Topic("/instruction", Instruction, latched=True)
+"""A."""
+TORQUE: Final = Topic("/torque", JointState)
+"""a_tau, normalised to [-1, 1], in `effort`."""
+TRUE_ABSTRACT_STATE: Final = Topic("/ground_truth/abstract_state", AbstractState)
+"""s_abst."""
+TRUE_POSE: Final = Topic("/ground_truth/pose", PoseStamped)
+TRUE_TWIST: Final = Topic("/ground_truth/twist", TwistStamped)
+"""Velocity in `MAP_FRAME`."""
+TRUE_BOXES: Final = Topic("/ground_truth/boxes", PoseArray)
+"""o_box."""
+TRUE_TERMINATION: Final = Topic("/ground_truth/termination", Termination)
+"""Whether A_{t-1} is completed by the rule of paper C.4."""
+TOP_CAMERA: Final = Topic("/camera_top/image_raw", Image)
+"""o_top, rgb8."""
+RECORDED: Final = Topic("/recorded", Header)
+"""The recorder has written the tick of this stamp."""
+
+TRUTH_TOPICS: Final = (TRUE_ABSTRACT_STATE, TRUE_POSE, TRUE_TWIST, TRUE_BOXES, TRUE_TERMINATION)
+"""What only oracles and recorders receive."""
+SIMULATOR_TOPICS: Final = (CLOCK, EPISODE, CAMERA, CAMERA_INFO, PROPRIO, POSE, *TRUTH_TOPICS, TOP_CAMERA)
+"""What the simulator publishes."""
+MODULE_TOPICS: Final = (ABSTRACT_STATE, TERMINATION, INSTRUCTION, TORQUE)
+"""What the four modules publish, in the order of a tick."""
+GRAPH_TOPICS: Final = {topic.name: topic for topic in (*SIMULATOR_TOPICS, *MODULE_TOPICS)}
+"""Every topic worth recording, by name."""
