@@ -49,11 +49,13 @@ def select(tree: Tree, rows: NDArray[np.int64]) -> Tree:
     return tree[rows]  # pyright: ignore
 
 
-def ticks(policy: SensePlanAct, world: World, episodes: Sequence[EpisodeSpec]) -> Iterator[Tick]:
+def ticks(
+    policy: SensePlanAct, world: World, episodes: Sequence[EpisodeSpec], *, camera: bool | None = None
+) -> Iterator[Tick]:
     """Play every episode once and yield each tick; a row takes the next episode as soon as its own has ended.
 
     Rows without a further episode leave the policy's batch, so that the last, long episodes cost no more
-    than they must. Frames are rendered only if a module looks at them.
+    than they must. Frames are rendered if a module looks at them, unless `camera` says otherwise.
     """
     if not episodes:
         return
@@ -65,7 +67,7 @@ def ticks(policy: SensePlanAct, world: World, episodes: Sequence[EpisodeSpec]) -
     step = np.zeros(len(rows), np.int64)
     seeds = np.array([episodes[i].seed for i in episode], np.int64)
     state = policy.initial_state(seeds)
-    camera = needs_camera(policy)
+    camera = needs_camera(policy) if camera is None else camera
     torque = np.zeros((world.batch, world.body.action_size), np.float32)
     instruction = np.zeros(world.batch, np.int64)
     issued = np.zeros(world.batch, np.bool_)
