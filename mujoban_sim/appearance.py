@@ -55,7 +55,7 @@ _PALETTE: Final = (
     ((165.0, 200.0), (0.15, 0.55), (0.35, 0.75)),
     ((265.0, 315.0), (0.12, 0.40), (0.35, 0.75)),
 )
-_MIN_CONTRAST: Final = 0.2
+_MIN_CONTRAST: Final = 0.25
 """Least distance in RGB between the mean colours of walls and floor."""
 
 
