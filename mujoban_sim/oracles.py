@@ -164,7 +164,7 @@ class DrivingGains:
     look_ahead: float = 0.4
     turn_limit: float = 0.5
     """Heading error above which the robot turns on the spot."""
-    roll_feed_forward: float = 0.2
+    roll_feed_forward: float = 0.5
     roll_gain: float = 0.5
     steer_gain: float = 1.5
     steer_damping: float = 0.05

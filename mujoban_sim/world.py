@@ -74,6 +74,7 @@ class World:
         agent_cell: (row, column) of the robot, int64 [B, 2]. If it rounds into a box's cell it keeps its last cell.
         box_cell: (row, column) of the boxes, int64 [B, K, 2]; (-1, -1) for those that a level lacks.
         box_on_target: bool [B, K]. A box is on a target when at least half of it in both axes lies within the pad.
+        boxes_on_target: number of boxes on targets, int64 [B].
         reward: of the last step: +1 for a box onto a target, -1 off one, +10 for solving; float32 [B].
         episode_return: sum of the rewards, float32 [B].
         steps: steps of the episode so far, int64 [B].
@@ -142,6 +143,7 @@ class World:
         self.box_cell = np.full((b, k, 2), -1, np.int64)
         self._target_cell = np.full((b, k, 2), -1, np.int64)
         self.box_on_target = np.zeros((b, k), np.bool_)
+        self.boxes_on_target = np.zeros(b, np.int64)
         self.reward = np.zeros(b, np.float32)
         self.episode_return = np.zeros(b, np.float32)
         self.steps = np.zeros(b, np.int64)
@@ -315,8 +317,8 @@ class World:
             self._joint_qpos, self._joint_qvel, body.cell_size, self.time_limit, self.box_count, self.target,
             goals.kind, goals.robot_target, goals.box_index, goals.box_target, goals.tolerance, goals.max_box_speed,
             goals.reached, self.pose, self.velocity, self.proprio, self.box_position, self.box_speed,
-            self.agent_cell, self.box_cell, self.box_on_target, self.reward, self.episode_return, self.steps,
-            self.solved, self.truncated,
+            self.agent_cell, self.box_cell, self.box_on_target, self.boxes_on_target, self.reward, self.episode_return,
+            self.steps, self.solved, self.truncated,
         )  # fmt: skip
 
     def abstract_state(self) -> NDArray[np.float32]:

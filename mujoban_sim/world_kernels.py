@@ -60,7 +60,7 @@ def _observe_robot(
         proprio[i] = sensors[i]
     joints = len(joint_qpos)
     for j in range(joints):
-        proprio[INERTIAL_SIZE + j] = wrap_angle(qpos[joint_qpos[j]])
+        proprio[INERTIAL_SIZE + j] = wrap_angle(float(qpos[joint_qpos[j]]))
         proprio[INERTIAL_SIZE + joints + j] = qvel[joint_qvel[j]]
     for i in range(UP_AXIS_SIZE):
         proprio[INERTIAL_SIZE + 2 * joints + i] = up[i]
@@ -78,12 +78,12 @@ def _observe_boxes(
     cell: NDArray[np.int64],
     on_target: NDArray[np.bool_],
 ) -> int:
-    """Fill position [K, 2], speed [K], cell [K, 2] and on_target [K] of one world's boxes; return the change.
+    """Fill position [K, 2], speed [K], cell [K, 2] and on_target [K] of a world's boxes; return how many are on.
 
-    The change is the number of boxes on targets, now minus before. At least half of a box, in both axes, lies
-    within a pad exactly when its centre does, so the pad that counts is that of the box's cell.
+    At least half of a box, in both axes, lies within a pad exactly when its centre does, so the pad that counts is that
+    of the box's cell.
     """
-    change = 0
+    total = 0
     for k in range(position.shape[0]):
         j = BOX_COORDINATES * k
         x, y = qpos[j], qpos[j + 1]
@@ -96,9 +96,9 @@ def _observe_boxes(
         else:
             cell[k, 0] = cell[k, 1] = -1
             on = False
-        change += int(on) - int(on_target[k])
         on_target[k] = on
-    return change
+        total += int(on)
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -143,6 +143,7 @@ def update(
     agent_cell: NDArray[np.int64],
     box_cell: NDArray[np.int64],
     box_on_target: NDArray[np.bool_],
+    boxes_on_target: NDArray[np.int64],
     reward: NDArray[np.float32],
     episode_return: NDArray[np.float32],
     steps: NDArray[np.int64],
@@ -161,25 +162,26 @@ def update(
             qpos[b, root:], qvel[b, root:], sensors[b], free_root, joint_qpos, joint_qvel,
             pose[b], velocity[b], proprio[b],
         )  # fmt: skip
-        change = _observe_boxes(
-            qpos[b], qvel[b], cell_size, box_count[b], target[b],
+        before = boxes_on_target[b]
+        boxes_on_target[b] = _observe_boxes(
+            qpos[b], qvel[b], cell_size, int(box_count[b]), target[b],
             box_position[b], box_speed[b], box_cell[b], box_on_target[b],
         )  # fmt: skip
         _locate_agent(qpos[b, root], qpos[b, root + 1], cell_size, box_cell[b], agent_cell[b])
         k = BOX_COORDINATES * box_index[b]
         robot_offset = (qpos[b, root] - robot_target[b, 0], qpos[b, root + 1] - robot_target[b, 1])
         box_offset = (qpos[b, k] - box_target[b, 0], qpos[b, k + 1] - box_target[b, 1])
-        speed = np.hypot(qvel[b, k], qvel[b, k + 1])
-        completed[b] = is_completed(kind[b], robot_offset, box_offset, speed, tolerance, max_box_speed)
+        speed = float(np.hypot(qvel[b, k], qvel[b, k + 1]))
+        completed[b] = is_completed(int(kind[b]), robot_offset, box_offset, speed, tolerance, max_box_speed)
         if not advance:
             continue
         reward[b] = 0.0
         if solved[b] or truncated[b]:
             continue
         steps[b] += 1
-        solved[b] = box_on_target[b].sum() == box_count[b]
+        solved[b] = boxes_on_target[b] == box_count[b]
         truncated[b] = steps[b] >= time_limit and not solved[b]
-        reward[b] = change * BOX_REWARD + (SOLVED_REWARD if solved[b] else 0.0)
+        reward[b] = (boxes_on_target[b] - before) * BOX_REWARD + (SOLVED_REWARD if solved[b] else 0.0)
         episode_return[b] += reward[b]
 
 

@@ -1,0 +1,258 @@
+"""The Gymnasium environment ``Mujoban-v0``: one robot, one level at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any, Final, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mujoban_sim.bodies import Body
+from mujoban_sim.camera import FRAME_SIZE
+from mujoban_sim.generator import TRAIN_SEEDS, generate_level
+from mujoban_sim.grid import CHANNELS, CONTROL_PERIOD, DIFFICULTIES, GRID_SIZE
+from mujoban_sim.levels import Level, read_levels
+from mujoban_sim.world import EpisodeSpec, World
+
+Observations = dict[str, Any]
+"""Arrays by name."""
+ObservationSet = Literal["default", "state", "privileged"]
+
+OBSERVATION_SETS: Final[dict[str, tuple[str, ...]]] = {
+    "default": ("frame", "proprio", "pose"),
+    "state": ("proprio", "pose", "velocity", "box_position", "abstract_state"),
+    "privileged": ("frame", "top_down", "proprio", "pose", "velocity", "box_position", "abstract_state"),
+}
+"""What is observed: as the robot perceives (paper appendix B), all but cameras, or everything."""
+RENDER_SIZE: Final = 256
+"""Rows and columns of what `render` returns."""
+
+_READERS: Final[dict[str, Callable[[World], NDArray[Any]]]] = {
+    "frame": World.render,
+    "top_down": lambda world: world.render("top_down"),
+    "proprio": lambda world: world.proprio.copy(),
+    "pose": lambda world: world.pose.copy(),
+    "velocity": lambda world: world.velocity.copy(),
+    "box_position": lambda world: world.box_position.copy(),
+    "abstract_state": World.abstract_state,
+}
+
+
+def observation_space(names: tuple[str, ...], body: Body, max_boxes: int) -> spaces.Dict:
+    """Return the space of one robot's observations of the given names."""
+
+    def image() -> spaces.Box:
+        return spaces.Box(0, 255, (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+
+    def real(*shape: int) -> spaces.Box:
+        return spaces.Box(-np.inf, np.inf, shape, np.float32)
+
+    known = {
+        "frame": image(),
+        "top_down": image(),
+        "proprio": real(body.proprio_size),
+        "pose": real(3),
+        "velocity": real(3),
+        "box_position": real(max_boxes, 2),
+        "abstract_state": spaces.Box(0.0, 1.0, (GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32),
+    }
+    return spaces.Dict({name: known[name] for name in names})
+
+
+@dataclass(frozen=True)
+class LevelSource:
+    """Turns an episode's seed into its level: a generated one, or one of a file.
+
+    Attributes:
+        difficulty: 1 to 5, of generated levels.
+        levels: levels of a file; the episode with seed s plays number s modulo their count. Empty: generate.
+    """
+
+    difficulty: int
+    levels: tuple[Level, ...] = ()
+
+    @classmethod
+    def make(cls, difficulty: int, level_file: str | PathLike[str] | None) -> LevelSource:
+        """Check the options and read the file.
+
+        Raises:
+            ValueError: if the difficulty is unknown or the file is malformed or empty.
+            OSError: if it cannot be read.
+        """
+        if difficulty not in DIFFICULTIES:
+            raise ValueError(f"unknown difficulty {difficulty!r}: expected one of {', '.join(map(str, DIFFICULTIES))}")
+        levels = () if level_file is None else tuple(read_levels(level_file))
+        if level_file is not None and not levels:
+            raise ValueError(f"level file {level_file} has no level: expected at least one")
+        return cls(difficulty, levels)
+
+    @property
+    def max_boxes(self) -> int:
+        """The most boxes of any level."""
+        return max((len(level.boxes) for level in self.levels), default=DIFFICULTIES[self.difficulty][1])
+
+    def episode(self, seed: int) -> EpisodeSpec:
+        """Return the episode with a given seed."""
+        if self.levels:
+            return EpisodeSpec(self.levels[seed % len(self.levels)], seed)
+        return EpisodeSpec(generate_level(self.difficulty, seed), seed)
+
+
+def draw_seed(generator: np.random.Generator) -> int:
+    """Return the seed of an episode for which the user gave none; never one of the test levels'."""
+    return int(generator.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop))
+
+
+def observe(world: World, names: tuple[str, ...]) -> Observations:
+    """Return copies of the named observations of all rows, each [B, ...]."""
+    return {name: _READERS[name](world) for name in names}
+
+
+def check_observation_set(name: str) -> tuple[str, ...]:
+    """Return the names of the observations in a set.
+
+    Raises:
+        ValueError: if there is no such set.
+    """
+    if name not in OBSERVATION_SETS:
+        raise ValueError(f"unknown observation set {name!r}: expected one of {', '.join(OBSERVATION_SETS)}")
+    return OBSERVATION_SETS[name]
+
+
+class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
+    """Sokoban in a physical 3D warehouse, seen through the robot's own camera.
+
+    ## Description
+    A robot pushes boxes onto target pads in a walled grid of up to 10 x 10 cells of 1 m (Karkus et al., 2020,
+    appendix B). It can push but not pull, pegs at the grid's corners keep boxes in lanes, and a box in a corner
+    stays there. Colours and textures are drawn anew for every episode; the skyline around stays the same.
+
+    ## Action space
+    ``Box(-1, 1, (U,), float32)``: normalised torques, held for 50 ms (20 Hz). The ball has U = 2:
+
+    | index | joint | 1.0 means |
+    |---|---|---|
+    | 0 | roll: drives the ball forwards (+) or backwards | 20 N m |
+    | 1 | steer: turns the robot to its left (+) or right | 20 N m |
+
+    A torque that is NaN or outside [-1, 1] raises `mujoban_sim.world.TorqueError`; wrap the environment in
+    ``gymnasium.wrappers.ClipAction`` for policies without bounds.
+
+    ## Observation space
+    A ``Dict`` with the keys of the observation set. Units are metres, radians and seconds, in the frame ``map``: x
+    east, y north, its origin at the centre of the padded grid, yaw counter-clockwise from east.
+
+    | key | space | meaning | sets |
+    |---|---|---|---|
+    | ``frame`` | uint8 (64, 64, 3) | first-person camera, RGB | default, privileged |
+    | ``proprio`` | float32 (P,) | proprioception, see `mujoban_sim.bodies.Body`; P = 16 | all |
+    | ``pose`` | float32 (3,) | x, y, yaw of the robot | all |
+    | ``velocity`` | float32 (3,) | vx, vy, yaw rate in the frame ``map`` | state, privileged |
+    | ``box_position`` | float32 (K, 2) | box centres; absent boxes lie 100 m away | state, privileged |
+    | ``abstract_state`` | float32 (10, 10, 4) | walls, targets, agent, boxes by cell, row 0 north | state, privileged |
+    | ``top_down`` | uint8 (64, 64, 3) | camera above the grid, RGB, north up | privileged |
+
+    ## Rewards
+    +1 for a box pushed onto a target pad, -1 for one pushed off, +10 for solving the level. A box is on a pad when at
+    least half of it, in both axes, lies within.
+
+    ## Starting state
+    Robot and boxes stand at the centres of their cells; the robot's heading is uniform. ``reset(seed=s)`` plays
+    episode s: the level generated from s (or number s modulo the count of a level file), with the heading and the
+    appearance of s. ``reset()`` draws a seed, never one of the test levels below 10,000,000.
+    ``reset(options={"level": level})`` plays a given `mujoban_sim.levels.Level`, or a level text.
+
+    ## Episode end
+    - ``terminated``: every box is on a target at once.
+    - ``truncated``: the time limit (4,800 steps, 240 s).
+
+    ## Info
+    ``reset``: ``seed``, and ``level`` as a text. ``step``: ``solved`` and ``boxes_on_target``.
+
+    ## Arguments
+    ``gymnasium.make("Mujoban-v0", difficulty=5, level_file=None, observations="default", body="ball",
+    time_limit=None, render_mode=None)``. `import mujoban_sim` registers the environment.
+
+    ## Version history
+    v0: first version.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium declares it so
+        "render_modes": ["rgb_array"],
+        "render_fps": round(1 / CONTROL_PERIOD),
+    }
+
+    def __init__(
+        self,
+        *,
+        difficulty: int = max(DIFFICULTIES),
+        level_file: str | PathLike[str] | None = None,
+        observations: ObservationSet = "default",
+        body: str = "ball",
+        time_limit: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Make the environment.
+
+        Args:
+            difficulty: 1 to 5, of generated levels (paper Table 3).
+            level_file: levels in the Boxoban format, instead of generated ones.
+            observations: observation set: ``"default"``, ``"state"`` (no cameras) or ``"privileged"``.
+            body: the robot's body.
+            time_limit: steps of an episode; None: the body's.
+            render_mode: None or ``"rgb_array"``: `render` returns a view from above.
+
+        Raises:
+            ValueError: if an argument is out of its range or the level file is malformed.
+        """
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"unknown render_mode {render_mode!r}: expected None or 'rgb_array'")
+        self.render_mode = render_mode
+        self._source = LevelSource.make(difficulty, level_file)
+        self._names = check_observation_set(observations)
+        self.world = World(1, body=body, max_boxes=self._source.max_boxes, time_limit=time_limit)
+        self.observation_space = observation_space(self._names, self.world.body, self.world.max_boxes)
+        self.action_space = spaces.Box(-1.0, 1.0, (self.world.body.action_size,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode; see the class for what `seed` and `options` do."""
+        super().reset(seed=seed)
+        chosen = draw_seed(self.np_random) if seed is None else seed
+        level = (options or {}).get("level")
+        if isinstance(level, str):
+            level = Level.from_text(level)
+        episode = self._source.episode(chosen) if level is None else EpisodeSpec(level, chosen)
+        self.world.reset([0], [episode])
+        return self._observe(), {"seed": chosen, "level": episode.level.to_text()}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+        """Apply torques, [U], for 50 ms.
+
+        Raises:
+            TorqueError: if they are malformed; nothing has moved then.
+        """
+        world = self.world
+        world.step(np.asarray(action)[None])
+        solved = bool(world.solved[0])
+        info = {"solved": solved, "boxes_on_target": int(world.boxes_on_target[0])}
+        return self._observe(), float(world.reward[0]), solved, bool(world.truncated[0]), info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Return a view from above, uint8 [256, 256, 3], if the render mode is ``"rgb_array"``."""
+        if self.render_mode is None:
+            return None
+        return self.world.render("top_down", size=RENDER_SIZE)[0]
+
+    def close(self) -> None:
+        """Free the cameras."""
+        self.world.close()
+
+    def _observe(self) -> Observations:
+        return {name: _READERS[name](self.world)[0] for name in self._names}
