@@ -120,6 +120,8 @@ class VisuomotorController(nn.Module, Controller):
         layout = get_body(body)
         self.config = {"body": body, "channels": list(channels), "features": features, "hidden": hidden}
         self.body = body
+        self.mixed_precision = False
+        """Whether the ResNet computes in bfloat16: training does, the robot does not, so that runs repeat exactly."""
         self.joints = len(layout.joints)
         self.proprio_size, self.action_size, self.hidden = layout.proprio_size, layout.action_size, hidden
         # Joint positions are replaced by two sine-cosine pairs; A is one-hot, beta one bit.
@@ -153,7 +155,9 @@ class VisuomotorController(nn.Module, Controller):
         """Return the ResNet's features [M, F] of frames uint8 [M, 64, 64, 3]."""
         # A permuted NHWC tensor is channels_last already.
         x = frame.permute(0, 3, 1, 2).to(self.mean.weight.dtype) / 255.0 - 0.5
-        return self.encoder(x)
+        with torch.autocast(frame.device.type, torch.bfloat16, enabled=self.mixed_precision):
+            features = self.encoder(x)
+        return features.to(x.dtype)
 
     def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor) -> Tensor:
         """Return the encoding of all other inputs, [M, F].

@@ -1,0 +1,308 @@
+"""The goal task in which the controller learns (paper C.3), over the vectorised world.
+
+The robot gets instructions, random or from a planner, and +4 for each that it completes, -5 for each that it
+does not complete within 120 steps, and a small penalty while it moves backwards. Boxes that leave the
+middle of their lanes cost something as well, since they jam at pegs later. An instruction that ends is followed
+by the next: the return bootstraps through it, except where one failed.
+
+Shapes: B robots, M selected rows, P proprioceptive values, U actuators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mujoban_controller.goal_features import drift, goal_offsets
+from mujoban_controller.instructions import (
+    EXACT,
+    InstructionConfig,
+    TerminationConfig,
+    TerminationNoise,
+    feasible_kinds,
+    random_instruction,
+)
+from mujoban_sim.goals import GoalKind
+from mujoban_sim.grid import COMPLETION_TOLERANCE, DIFFICULTIES, INSTRUCTION_LIMIT, Instruction
+from mujoban_sim.interfaces import ControllerInput, Planner, put_rows, take_rows
+from mujoban_sim.world import EpisodeSpec, World
+
+EpisodeSource = Callable[[], EpisodeSpec]
+"""Yields the next episode to play."""
+
+
+@dataclass(frozen=True)
+class GoalTaskConfig:
+    """Settings of the goal task."""
+
+    batch: int = 64
+    """B, robots."""
+    body: str = "ball"
+    difficulty: int = 5
+    tolerance: float = 0.08
+    """Completion tolerance in cells; tighter than the paper's 0.1, so that evaluation leaves a margin."""
+    planned: float = 0.6
+    """Share of episodes that follow the planner."""
+    astray: float = 0.06
+    """Chance that a random instruction takes the place of a planned one."""
+    horizon: int = 600
+    """Steps of an episode of random instructions; planned ones go on until the level is solved."""
+    patience: int = 3
+    """Instructions that fail in a row before the episode is given up, since a jammed box stays jammed."""
+    misaligned: float = 0.5
+    """Share of episodes that begin with robot and boxes off the centres of their cells."""
+    robot_offset: float = 0.25
+    box_offset: float = 0.1
+    """Largest such offsets in cells; boxes move along one axis only, across it by less than half of that."""
+    completed_reward: float = 4.0
+    failed_reward: float = -5.0
+    backwards_penalty: float = 0.02
+    """Cost of a step in which the robot moves backwards. Tiny: after a push it has to back up before it turns."""
+    drift_penalty: float = 10.0
+    """Cost of each cell by which boxes leave the middle of their lanes."""
+    instructions: InstructionConfig = field(default_factory=InstructionConfig)
+    terminations: TerminationConfig = field(default_factory=TerminationConfig)
+
+    def __post_init__(self) -> None:
+        """Reject settings that contradict each other."""
+        if self.difficulty not in DIFFICULTIES:
+            raise ValueError(f"difficulty {self.difficulty}: expected one of {sorted(DIFFICULTIES)}")
+        if not 0.0 < self.tolerance <= COMPLETION_TOLERANCE:
+            raise ValueError(f"tolerance {self.tolerance}: expected at most the evaluation's {COMPLETION_TOLERANCE}")
+
+
+def judging_config(batch: int, body: str = "ball", difficulty: int = 5) -> GoalTaskConfig:
+    """Return the settings under which controllers are judged: the planner's instructions, exact signals."""
+    return GoalTaskConfig(
+        batch=batch,
+        body=body,
+        difficulty=difficulty,
+        tolerance=COMPLETION_TOLERANCE,
+        planned=1.0,
+        astray=0.0,
+        misaligned=0.0,
+        patience=12,
+        terminations=EXACT,
+    )
+
+
+class Outcome(NamedTuple):
+    """How an instruction ended."""
+
+    row: int
+    kind: GoalKind
+    direction: Instruction
+    completed: bool
+    ticks: int
+    off_lane: bool
+    """Whether the pushed box stands across its lane by more than the tolerance."""
+    wrong_cell: bool
+    """Whether robot or boxes are in cells to which the instruction does not lead."""
+
+
+class EpisodeEnd(NamedTuple):
+    """How an episode ended."""
+
+    row: int
+    seed: int
+    solved: bool
+    episode_return: float
+    steps: int
+
+
+class TaskStep(NamedTuple):
+    """Result of `GoalTask.step`."""
+
+    reward: NDArray[np.float32]
+    """[B]."""
+    discount: NDArray[np.float32]
+    """0 where an instruction failed or the episode ended, else 1, [B]."""
+    outcomes: list[Outcome]
+    """Instructions that ended."""
+    episodes: list[EpisodeEnd]
+    """Episodes that ended."""
+
+
+class GoalTask:
+    """B robots that follow instructions; the instruction in force is chosen before each step.
+
+    Attributes:
+        world: The physical world; its `goals` are those of the instructions in force.
+        instruction: A_t, int64 [B].
+        terminated: beta_t, bool [B].
+        first: Whether tick t is the first of an episode, bool [B].
+        planned: Whether the row follows the planner, bool [B].
+    """
+
+    def __init__(
+        self,
+        config: GoalTaskConfig,
+        planner: Planner,
+        episodes: EpisodeSource,
+        rng: np.random.Generator,
+        *,
+        threads: int = 1,
+    ) -> None:
+        """Start an episode in every row.
+
+        Args:
+            config: Settings.
+            planner: Gives the instructions of planned episodes; it sees true abstract states.
+            episodes: Levels and seeds.
+            rng: Source of all other randomness.
+            threads: Threads for physics.
+        """
+        self.config = config
+        self.world = World(
+            config.batch,
+            body=config.body,
+            max_boxes=DIFFICULTIES[config.difficulty][1],
+            threads=threads,
+            tolerance=config.tolerance,
+        )
+        self._planner, self._episodes, self._rng = planner, episodes, rng
+        self._memory = planner.initial_memory(config.batch)
+        self._noise = TerminationNoise(config.batch, config.terminations, rng)
+        b = config.batch
+        self.instruction = np.full(b, int(Instruction.STAY), np.int64)
+        self.terminated = np.zeros(b, np.bool_)
+        self.first = np.ones(b, np.bool_)
+        self.planned = np.zeros(b, np.bool_)
+        self._start_boxes = self.world.box_cell.copy()
+        self._failures = np.zeros(b, np.int64)
+        self._completed = np.zeros(b, np.bool_)
+        self._begin_episodes(np.arange(b))
+        self._issue(np.arange(b))
+
+    @property
+    def elapsed(self) -> NDArray[np.float64]:
+        """Share of the time limit that the instruction in force has had, [B]."""
+        return self._noise.elapsed / INSTRUCTION_LIMIT
+
+    def observe(self, *, camera: bool = True) -> ControllerInput:
+        """Return what controllers see in this tick, ground truth included; without `camera` frames are empty."""
+        world, b = self.world, self.world.batch
+        frame = world.render() if camera else np.zeros((b, 0, 0, 3), np.uint8)
+        # What is completed is told of the instruction before, as everywhere in the graph.
+        truth = world.truth()._replace(completed=self._completed.copy())
+        return ControllerInput(
+            self.instruction.copy(), frame, world.proprio.copy(), self.terminated.copy(), truth
+        )
+
+    def step(self, torque: NDArray[np.float32]) -> TaskStep:
+        """Apply torques in [-1, 1], [B, U]; then end instructions and episodes and choose the next ones."""
+        world, config = self.world, self.config
+        before = drift(world)
+        world.step(torque)
+        completed = world.completed.copy()
+        ended = self._noise.step(completed, self._distance()) | world.done
+        failed = ended & ~completed & (self._noise.elapsed >= config.terminations.limit)
+        reward = config.completed_reward * (ended & completed) + config.failed_reward * failed
+        reward -= config.drift_penalty * np.maximum(drift(world) - before, 0.0)
+        reward -= config.backwards_penalty * (self._forward_speed() < -0.05 * world.body.cell_size)
+        rows = np.flatnonzero(ended)
+        # An instruction that the end of its episode cut short says nothing.
+        judged = np.flatnonzero(ended & (completed | failed))
+        outcomes = [self._outcome(b, bool(completed[b])) for b in judged.tolist()]
+        self._failures = np.where(failed, self._failures + 1, np.where(ended, 0, self._failures))
+        over = world.done | (ended & ~self.planned & (world.steps >= config.horizon))
+        over |= self._failures >= config.patience
+        self._completed = completed & ~over
+        episodes = [self._episode_end(b) for b in np.flatnonzero(over).tolist()]
+        self.terminated, self.first = ended & ~over, over
+        if over.any():
+            self._begin_episodes(np.flatnonzero(over))
+        if rows.size:
+            self._issue(rows)
+        return TaskStep(reward.astype(np.float32), (~(failed | over)).astype(np.float32), outcomes, episodes)
+
+    def _episode_end(self, row: int) -> EpisodeEnd:
+        world = self.world
+        spec = world.episodes[row]
+        seed = -1 if spec is None else spec.seed
+        return EpisodeEnd(
+            row, seed, bool(world.solved[row]), float(world.episode_return[row]), int(world.steps[row])
+        )
+
+    def _forward_speed(self) -> NDArray[np.float32]:
+        heading = self.world.pose[:, 2]
+        return self.world.velocity[:, 0] * np.cos(heading) + self.world.velocity[:, 1] * np.sin(heading)
+
+    def _distance(self) -> NDArray[np.float64]:
+        """Return the distance, beyond the tolerance, of what has to reach its target, in cells, [B]."""
+        offsets = goal_offsets(self.world)
+        push = self.world.goals.kind == GoalKind.PUSH
+        pair = np.where(push[:, None], offsets[:, 2:], offsets[:, :2])
+        return np.hypot(pair[:, 0], pair[:, 1]) - self.config.tolerance
+
+    def _outcome(self, row: int, completed: bool) -> Outcome:
+        world, goals = self.world, self.world.goals
+        kind, index = GoalKind(int(goals.kind[row])), int(goals.box_index[row])
+        expected = self._start_boxes[row].copy()
+        if kind == GoalKind.PUSH and completed:
+            expected[index] += goals.goal_cell[row] - goals.origin_cell[row]
+        astray = bool((world.box_cell[row] != expected).any())
+        astray |= bool((world.agent_cell[row] != goals.goal_cell[row]).any()) and completed
+        across = abs(goal_offsets(world)[row, 3])
+        return Outcome(
+            row,
+            kind,
+            Instruction(int(goals.direction[row])),
+            completed,
+            int(self._noise.elapsed[row]),
+            kind == GoalKind.PUSH and bool(across > self.config.tolerance),
+            astray,
+        )
+
+    def _begin_episodes(self, rows: NDArray[np.int64]) -> None:
+        config, rng = self.config, self._rng
+        self.world.reset(rows, [self._episodes() for _ in rows])
+        self._failures[rows] = 0
+        self.planned[rows] = rng.random(len(rows)) < config.planned
+        if self._memory:
+            self._memory = put_rows(self._memory, rows, self._planner.initial_memory(len(rows)))
+        shaken = rows[rng.random(len(rows)) < config.misaligned]
+        if shaken.size:
+            self._misalign(shaken)
+
+    def _misalign(self, rows: NDArray[np.int64]) -> None:
+        config, rng, world = self.config, self._rng, self.world
+        size, m, k = world.body.cell_size, len(rows), world.max_boxes
+        pose = world.pose[rows].astype(np.float64)
+        pose[:, :2] += rng.uniform(-1, 1, (m, 2)) * config.robot_offset * size
+        # A box that is off along both axes would overlap a peg.
+        lopsided = np.where(rng.random((m, k, 1)) < 0.5, [[1.0, 0.4]], [[0.4, 1.0]])
+        boxes = world.box_position[rows] + rng.uniform(-1, 1, (m, k, 2)) * lopsided * config.box_offset * size
+        world.place(rows, pose, boxes)
+
+    def _issue(self, rows: NDArray[np.int64]) -> None:
+        world = self.world
+        previous = self.instruction.copy()
+        astray = self._rng.random(world.batch) < self.config.astray
+        random = np.zeros(world.batch, np.bool_)
+        random[rows] = (~self.planned | astray)[rows]
+        planned = rows[self.planned[rows]]
+        if planned.size:
+            state = world.abstract_state()[planned]
+            decided, memory = self._planner.decide(state, take_rows(self._memory, planned))
+            self.instruction[planned] = decided
+            self._memory = put_rows(self._memory, planned, memory) if self._memory else ()
+            if self.config.planned < 1.0:
+                # No plan is left: the planner stays, the row goes on at random.
+                lost = planned[decided == Instruction.STAY]
+                self.planned[lost], random[lost] = False, True
+        if random.any():
+            kinds = feasible_kinds(world)
+            for b in np.flatnonzero(random).tolist():
+                self.instruction[b] = random_instruction(
+                    kinds[b], int(previous[b]), self.config.instructions, self._rng
+                )
+        issued = np.zeros(world.batch, np.bool_)
+        issued[rows] = True
+        world.instruct(self.instruction, issued)
+        self._start_boxes[rows] = world.box_cell[rows]
+        self._noise.issue(rows)

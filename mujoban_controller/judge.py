@@ -1,0 +1,149 @@
+"""Judge a controller on instructions and on whole episodes of a planner's solutions.
+
+Instruction success does not predict episode success: one box jammed at a peg loses the level. So controllers are
+judged by the levels that they solve under a solver's plans, and failures are told apart.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mujoban_controller.goal_task import EpisodeEnd, GoalTask, Outcome, judging_config
+from mujoban_rl.stats import wilson_interval
+from mujoban_sim.generator import generate_level
+from mujoban_sim.goals import GoalKind
+from mujoban_sim.grid import Instruction
+from mujoban_sim.interfaces import Controller, Planner, renew_rows
+from mujoban_sim.world import EpisodeSpec
+
+
+def kind_name(outcome: Outcome) -> str:
+    """Return move, push, stay or blocked (an infeasible instruction)."""
+    if outcome.kind == GoalKind.HOLD:
+        return "stay" if outcome.direction == Instruction.STAY else "blocked"
+    return outcome.kind.name.lower()
+
+
+def failure_name(outcome: Outcome) -> str:
+    """Return why an instruction failed: the box left its lane, someone is in a wrong cell, or time ran out."""
+    if outcome.off_lane:
+        return "box off lane"
+    return "wrong cell" if outcome.wrong_cell else "time-out"
+
+
+@dataclass
+class OutcomeSummary:
+    """Success and duration of instructions by kind."""
+
+    ticks: dict[str, list[int]] = field(default_factory=dict)
+    """Ticks of completed instructions."""
+    count: Counter[str] = field(default_factory=Counter)
+    failures: Counter[str] = field(default_factory=Counter)
+    displaced: int = 0
+    """Completed instructions that left robot or boxes in wrong cells."""
+
+    def add(self, outcomes: Iterable[Outcome]) -> None:
+        """Count outcomes."""
+        for outcome in outcomes:
+            kind = kind_name(outcome)
+            self.count[kind] += 1
+            if outcome.completed:
+                self.ticks.setdefault(kind, []).append(outcome.ticks)
+                self.displaced += outcome.wrong_cell
+            else:
+                self.failures[failure_name(outcome)] += 1
+
+    def report(self) -> dict[str, Any]:
+        """Return success rate with interval, median and 95th-percentile ticks by kind, and the failures."""
+        kinds = {}
+        for kind, n in sorted(self.count.items()):
+            ticks = self.ticks.get(kind, [])
+            kinds[kind] = {
+                "n": n,
+                "success_rate": len(ticks) / n,
+                "success_interval": list(wilson_interval(len(ticks), n)),
+                "median_steps": float(np.median(ticks)) if ticks else None,
+                "p95_steps": float(np.percentile(ticks, 95)) if ticks else None,
+            }
+        return {"kinds": kinds, "failures": dict(self.failures), "displaced": self.displaced}
+
+
+class SeededEpisodes:
+    """Episodes of consecutive seeds at one difficulty."""
+
+    def __init__(self, difficulty: int, first_seed: int) -> None:
+        """Start with the level of `first_seed`."""
+        self._difficulty = difficulty
+        self._seeds: Iterator[int] = iter(range(first_seed, first_seed + 2**40))
+
+    def __call__(self) -> EpisodeSpec:
+        """Return the next episode."""
+        seed = next(self._seeds)
+        return EpisodeSpec(generate_level(self._difficulty, seed), seed)
+
+
+def judge(
+    controller: Controller,
+    planner: Planner,
+    *,
+    episodes: int,
+    first_seed: int = 0,
+    difficulty: int = 5,
+    body: str = "ball",
+    batch: int = 64,
+    threads: int = 1,
+) -> dict[str, Any]:
+    """Play whole episodes with a planner's instructions and exact termination signals.
+
+    Args:
+        controller: Learned or privileged.
+        planner: Gives the instructions from true abstract states.
+        episodes: Levels to play, with seeds `first_seed`, `first_seed` + 1, ...
+        first_seed: Seed of the first level.
+        difficulty: Of the levels.
+        body: Robot's body.
+        batch: Levels played at once.
+        threads: Threads for physics.
+
+    Returns:
+        `success_rate`, `success_interval`, `mean_return`, `median_steps`, `lost` (seeds with the last failure of
+        each) and `instructions` (see `OutcomeSummary.report`).
+    """
+    batch = min(batch, episodes)
+    task = GoalTask(
+        judging_config(batch, body, difficulty), planner, SeededEpisodes(difficulty, first_seed),
+        np.random.default_rng(first_seed), threads=threads,
+    )  # fmt: skip
+    last_seed = first_seed + episodes
+    state = controller.initial_memory(batch)
+    summary, ended, lost, last_failure = OutcomeSummary(), list[EpisodeEnd](), dict[str, str](), dict[int, str]()
+    seeds = np.array([spec.seed for spec in task.world.episodes if spec is not None])
+    while len(ended) < episodes:
+        state = renew_rows(state, controller.initial_memory(batch), task.first)
+        torque, state = controller.step(task.observe(camera=not controller.privileged), state)
+        result = task.step(torque)
+        counted = [o for o in result.outcomes if seeds[o.row] < last_seed]
+        summary.add(counted)
+        last_failure |= {o.row: failure_name(o) for o in counted if not o.completed}
+        for end in result.episodes:
+            failure = last_failure.pop(end.row, "time limit")
+            if end.seed < last_seed:
+                ended.append(end)
+                if not end.solved:
+                    lost[str(end.seed)] = failure
+            spec = task.world.episodes[end.row]
+            seeds[end.row] = last_seed if spec is None else spec.seed
+    solved = sum(e.solved for e in ended)
+    return {
+        "success_rate": solved / episodes,
+        "success_interval": list(wilson_interval(solved, episodes)),
+        "mean_return": float(np.mean([e.episode_return for e in ended])),
+        "median_steps": float(np.median([e.steps for e in ended])),
+        "lost": lost,
+        "instructions": summary.report(),
+    }

@@ -1,0 +1,55 @@
+"""The controller's node: A, o_cam, o_pr, beta -> a_tau (`python -m mujoban_controller.node`)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from mujoban_msgs.msg import Episode
+
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.module_node import ModuleNode
+from mujoban_msgs_py.tick_node import Input, Output, run_node
+from mujoban_sim.interfaces import ControllerInput, GroundTruth
+
+
+class ControllerNode(ModuleNode):
+    """Publishes `/torque`; parameters as in `ModuleNode`."""
+
+    role = "controller"
+    inputs = (
+        Input(topics.INSTRUCTION, conversions.instruction_from_msg),
+        Input(topics.CAMERA, conversions.frame_from_msg),
+        Input(topics.PROPRIO, conversions.proprio_from_msg),
+        Input(topics.TERMINATION, conversions.termination_from_msg),
+    )
+
+    def __init__(self, **options: Any) -> None:
+        """Load the module and start listening."""
+        super().__init__(**options)
+        self._publisher = self.create_output(topics.TORQUE)
+
+    def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
+        """Act for one tick."""
+        torque, self.state = self.module.step(
+            ControllerInput(
+                np.array([inputs[topics.INSTRUCTION.name].direction], np.int64),
+                inputs[topics.CAMERA.name][None],
+                inputs[topics.PROPRIO.name][None],
+                np.array([inputs[topics.TERMINATION.name].terminated]),
+                truth,
+            ),
+            self.state,
+        )
+        return [Output(self._publisher, conversions.torque_to_msg(episode.header, torque[0]))]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(ControllerNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
