@@ -211,19 +211,19 @@ def draw_atlas(seed: int) -> Image:
         RGB of `ATLAS_SHAPE`; row 0 is at v = 0.
     """
     rng = np.random.default_rng([_APPEARANCE_STREAM, seed])
-    wall, floor = _draw_colour(rng), _draw_colour(rng)
-    while np.linalg.norm(wall - floor) < _MIN_CONTRAST:
-        floor = _draw_colour(rng)
     grit = 1.0 + 0.08 * (_fractal_noise(rng, (_CELL_PIXELS, _CELL_PIXELS)) - 0.5)
+    wall = _draw_colour(rng)
     bands = {
         "side": _paint(rng, wall, grit[: _BAND_PIXELS["side"]]),
         "top": _paint(rng, np.clip(wall * rng.choice([0.75, 1.2]), 0.0, 0.9), grit),
-        "floor": _paint(rng, floor, grit),
+        "floor": _paint(rng, _draw_colour(rng), grit),
         "peg": np.full((_BAND_PIXELS["peg"], _CELL_PIXELS, 3), 0.45),
     }
-    border = np.clip(floor * (0.55 if floor.mean() > 0.4 else 1.6), 0.0, 0.9)
-    _outline(bands["floor"], border, 4)
-    _outline(bands["top"], np.clip(0.75 * bands["top"].mean(axis=(0, 1)), 0.0, 1.0), 2)
+    while min(np.linalg.norm(_mean(bands[b]) - _mean(bands["floor"])) for b in ("side", "top")) < _MIN_CONTRAST:
+        bands["floor"] = _paint(rng, _draw_colour(rng), grit)
+    floor = _mean(bands["floor"])
+    _outline(bands["floor"], np.clip(floor * (0.55 if floor.mean() > 0.4 else 1.6), 0.0, 0.9), 4)
+    _outline(bands["top"], 0.75 * _mean(bands["top"]), 3)
     rows = [np.pad(bands[b], ((_GUTTER, _GUTTER), (0, 0), (0, 0)), mode="wrap") for b in BANDS]
     return np.rint(255 * np.clip(np.concatenate(rows), 0.0, 1.0)).astype(np.uint8)
 
