@@ -55,7 +55,7 @@ def _mjcf(body: Body, max_boxes: int, size: int) -> str:
         f'<geom name="target{i}" type="box" size="{cell / 2} {cell / 2} {_PAD_THICKNESS}"/>' for i in range(max_boxes)
     )
     height = _TOP_DOWN_HEIGHT * cell
-    half_width = (GRID_SIZE / 2 + 0.05) * cell
+    half_width = GRID_SIZE / 2 * cell
     fovy = 2 * np.degrees(np.arctan2(half_width, height - DRAWN_WALL_HEIGHT * cell))
     scale = max(cell, 1.0)
     return f"""

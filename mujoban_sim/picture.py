@@ -1,0 +1,106 @@
+"""A picture of the world: what the robot sees at four moments of an episode, beside the view from above at the last.
+
+Run as ``python -m mujoban_sim.picture docs/images/world.png --seed 5``; the episode is played by the oracles.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from PIL import Image
+
+from mujoban_sim.camera import FRAME_SIZE
+from mujoban_sim.generator import generate_level
+from mujoban_sim.interfaces import Observation
+from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
+from mujoban_sim.rendering import RenderingError
+from mujoban_sim.sense_plan_act import SensePlanAct
+from mujoban_sim.world import EpisodeSpec, World
+
+_SIZE = 480
+"""Rows of the picture in pixels; frames are drawn twice as large and scaled down."""
+_GAP = 8
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Draw a picture of the world."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """Where to write the PNG."""
+    seed: int = 5
+    """Seed of the episode, at least 0."""
+    difficulty: int = 5
+    """1 to 5."""
+    steps: int = 600
+    """Steps of the episode to the last moment, 20 a second."""
+
+    def __post_init__(self) -> None:
+        """Check the arguments."""
+        if self.steps < 4:
+            raise ValueError(f"steps is {self.steps}: expected at least 4")
+
+
+def _scaled(frame: NDArray[np.uint8], size: int) -> Image.Image:
+    return Image.fromarray(frame).resize((size, size), Image.Resampling.LANCZOS)
+
+
+def draw_picture(config: Picture) -> Image.Image:
+    """Return the picture, RGB.
+
+    Raises:
+        RenderingError: if there is no OpenGL.
+        ValueError: if seed or difficulty is out of range.
+    """
+    level = generate_level(config.difficulty, config.seed)
+    world = World(1, max_boxes=len(level.boxes))
+    world.reset([0], [EpisodeSpec(level, config.seed)])
+    policy = SensePlanAct(OracleEstimator(), OracleTermination(), OraclePlanner(), OracleController())
+    state = policy.initial_state(np.array([config.seed]))
+    unseen = np.zeros((1, FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+    views = []
+    for step in range(1, config.steps + 1):
+        observation = Observation(unseen, world.proprio.copy(), world.pose.copy())
+        decision, state = policy.step(observation, world.truth(), state)
+        world.instruct(decision.instruction, decision.issued)
+        world.step(decision.torque)
+        over = bool(world.solved[0])
+        if over or step * 4 // config.steps > len(views):
+            views.append(world.render(size=2 * _SIZE)[0])
+        if over:
+            break
+    above = world.render("top_down", size=2 * _SIZE)[0]
+    world.close()
+    return _compose(above, views[:4])
+
+
+def _compose(above: NDArray[np.uint8], views: list[NDArray[np.uint8]]) -> Image.Image:
+    """Return the view from above with up to four frames in a square to its right."""
+    small = (_SIZE - _GAP) // 2
+    picture = Image.new("RGB", (2 * _SIZE + _GAP, _SIZE), "white")
+    picture.paste(_scaled(above, _SIZE), (0, 0))
+    for i, view in enumerate(views):
+        row, col = divmod(i, 2)
+        picture.paste(_scaled(view, small), (_SIZE + _GAP + col * (small + _GAP), row * (small + _GAP)))
+    return picture
+
+
+def main(args: list[str] | None = None) -> None:
+    """Draw the picture that the command line asks for."""
+    try:
+        config = tyro.cli(Picture, args=args, description=__doc__)
+        config.path.parent.mkdir(parents=True, exist_ok=True)
+        draw_picture(config).save(config.path, optimize=True)
+    except (RenderingError, ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
