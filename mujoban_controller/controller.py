@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from mujoban_sim.bodies import INERTIAL_SIZE, get_body
 from mujoban_sim.camera import FRAME_SIZE
@@ -70,7 +70,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [B, C, H, W] to [B, C', H / stride, W / stride]."""
-        return F.relu(self.shortcut(x) + self.second(F.relu(self.first(x))))
+        return functional.relu(self.shortcut(x) + self.second(functional.relu(self.first(x))))
 
 
 def frame_encoder(channels: Sequence[int], features: int) -> nn.Sequential:
@@ -176,7 +176,7 @@ class VisuomotorController(nn.Module, Controller):
         along, left = self.direction[instruction].unbind(-1)
         along, left = along[:, None], left[:, None]
         turned = (cos * along + sin * left, sin * along - cos * left)
-        symbol = F.one_hot(instruction, len(Instruction)).to(proprio.dtype)
+        symbol = functional.one_hot(instruction, len(Instruction)).to(proprio.dtype)
         beta = terminated.to(proprio.dtype)[:, None]
         return self.body_encoder(torch.cat([rest, cos, sin, *turned, symbol, beta], -1))
 
@@ -219,7 +219,7 @@ class VisuomotorController(nn.Module, Controller):
         """Return the distribution over torques given `ControllerOutput.features`."""
         x = self.trunk(features)
         unit = math.log(math.expm1(1.0))
-        return Gaussian(self.mean(x), INITIAL_SCALE * F.softplus(self.scale(x) + unit) + MIN_SCALE)
+        return Gaussian(self.mean(x), INITIAL_SCALE * functional.softplus(self.scale(x) + unit) + MIN_SCALE)
 
     def initial_memory(self, batch: int) -> Memory:
         """Return zeros: LSTM output and cell, [B, H] each."""

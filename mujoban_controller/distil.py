@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
 from mujoban_controller.controller import ControllerOutput, VisuomotorController
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
@@ -88,12 +88,12 @@ def imitation_loss(
     """Return loss and statistics of a batch of sequences [M, T]."""
     mean, scale = output.action
     label = batch["label"]
-    action = F.smooth_l1_loss(mean, label, beta=0.1)
+    action = functional.smooth_l1_loss(mean, label, beta=0.1)
     # The scale learns how far the teacher's torques stray from the mean, and does not move the mean.
     spread = -torch.distributions.Normal(mean.detach(), scale).log_prob(label).clamp(-10.0, 3.0).mean()
     offsets, logits = head(output.features)
-    goal = F.smooth_l1_loss(offsets, batch["goal"], beta=0.1)
-    kind = F.cross_entropy(logits.flatten(0, 1), batch["kind"].flatten())
+    goal = functional.smooth_l1_loss(offsets, batch["goal"], beta=0.1)
+    kind = functional.cross_entropy(logits.flatten(0, 1), batch["kind"].flatten())
     loss = action + 0.01 * spread + config.goal_weight * goal + config.kind_weight * kind
     stats = {
         "loss/action": action,

@@ -1,0 +1,133 @@
+"""Continuous MPO against problems whose solution is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from mujoban_rl.mpo_continuous import (
+    MPOConfig,
+    MPOLoss,
+    action_cost,
+    gaussian_kl,
+    gaussian_log_prob,
+    nonparametric_kl,
+    td_target,
+    weights_and_temperature_loss,
+)
+
+
+class Bandit:
+    """A policy over one state's actions, trained with exact values."""
+
+    def __init__(self, value, *, size=2, config=None, initial_scale=0.5, rate=1e-2, seed=0):
+        self.generator = torch.Generator().manual_seed(seed)
+        self.value = value
+        self.mean = nn.Parameter(torch.zeros(size))
+        self.log_scale = nn.Parameter(torch.full((size,), math.log(initial_scale)))
+        self.target = (self.mean.detach().clone(), self.log_scale.detach().exp())
+        self.loss = MPOLoss(size, config)
+        self.policy_optimiser = torch.optim.Adam([self.mean, self.log_scale], rate)
+        self.dual_optimiser = torch.optim.Adam(self.loss.parameters(), 3e-2)
+
+    def run(self, steps, period=10, states=32, samples=20):
+        history = []
+        for step in range(steps):
+            target_mean, target_scale = (t.expand(states, -1) for t in self.target)
+            noise = torch.randn(samples, states, len(self.mean), generator=self.generator)
+            action = target_mean + target_scale * noise
+            online = (self.mean.expand(states, -1), self.log_scale.exp().expand(states, -1))
+            loss, stats = self.loss(online, (target_mean, target_scale), action, self.value(action))
+            self.policy_optimiser.zero_grad()
+            self.dual_optimiser.zero_grad()
+            loss.backward()
+            self.policy_optimiser.step()
+            self.dual_optimiser.step()
+            self.loss.limit_duals()
+            history.append({k: float(v) for k, v in stats.items()})
+            if step % period == period - 1:
+                self.target = (self.mean.detach().clone(), self.log_scale.detach().exp())
+        return history
+
+
+GOLDEN = MPOConfig(initial_temperature=1.0, initial_alpha_mean=1.0, initial_alpha_scale=1.0, epsilon_scale=1e-4)
+
+
+def test_converges_to_the_optimum_of_a_quadratic_bandit():
+    optimum = torch.tensor([0.6, -0.3])
+    bandit = Bandit(lambda a: -10 * ((a - optimum) ** 2).sum(-1), config=GOLDEN)
+    bandit.run(1200)
+    assert torch.allclose(bandit.mean, optimum, atol=0.05)
+    assert bool((bandit.log_scale.exp() < 0.4).all())
+
+
+def test_temperature_settles_where_the_e_step_meets_its_constraint():
+    config = MPOConfig(initial_temperature=1.0, initial_alpha_mean=1.0)
+    history = Bandit(lambda a: 3 * a.sum(-1), config=config).run(500)
+    assert np.mean([h["kl_q_relative"] for h in history[-100:]]) == pytest.approx(1.0, abs=0.15)
+
+
+def test_mean_moves_at_the_speed_of_its_constraint():
+    # On a slope that never ends, nothing but the constraint holds the mean back.
+    config = MPOConfig(
+        initial_temperature=1.0, initial_alpha_mean=20.0, epsilon_mean=1e-3, epsilon_penalty=0.0, epsilon_scale=1e-5
+    )
+    history = Bandit(lambda a: 30 * a.sum(-1), config=config, rate=2e-3).run(900, period=25)
+    ends = [h["kl_mean_relative"] for h in history[-250:]]
+    assert np.mean(ends) == pytest.approx(1.0, abs=0.5)
+
+
+def test_action_penalty_keeps_the_mean_near_the_box():
+    free = Bandit(lambda a: 5 * a.sum(-1), config=MPOConfig(initial_temperature=1.0, initial_alpha_mean=1.0,
+                                                            epsilon_penalty=0.0))
+    bound = Bandit(lambda a: 5 * a.clamp(-1, 1).sum(-1), config=MPOConfig(
+        initial_temperature=1.0, initial_alpha_mean=1.0, epsilon_penalty=0.1))
+    free.run(600)
+    bound.run(600)
+    assert float(free.mean.detach().min()) > 1.2
+    assert 0.6 < float(bound.mean.detach().mean()) < 1.2
+
+
+def test_optimal_temperature_minimises_its_dual():
+    q = torch.randn(500, 8, generator=torch.Generator().manual_seed(1))
+    log_temperature = nn.Parameter(torch.tensor(0.0))
+    optimiser = torch.optim.Adam([log_temperature], 0.05)
+    for _ in range(300):
+        weights, loss = weights_and_temperature_loss(q, 0.1, log_temperature.exp())
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    assert float(nonparametric_kl(weights).mean()) == pytest.approx(0.1, rel=0.05)
+    # For Q ~ N(0, 1) the reweighted distribution is N(1 / eta, 1), whose KL is 1 / (2 eta^2).
+    assert float(log_temperature.detach().exp()) == pytest.approx(math.sqrt(5), rel=0.1)
+
+
+def test_densities_and_divergences_agree_with_torch():
+    mean, scale = torch.tensor([[0.1, -0.2]]), torch.tensor([[0.5, 1.5]])
+    other_mean, other_scale = torch.tensor([[0.3, 0.4]]), torch.tensor([[0.9, 0.8]])
+    p, q = torch.distributions.Normal(mean, scale), torch.distributions.Normal(other_mean, other_scale)
+    expected = torch.distributions.kl_divergence(p, q)
+    assert torch.allclose(gaussian_kl(mean, scale, other_mean, other_scale), expected)
+    action = torch.randn(7, 1, 2)
+    assert torch.allclose(gaussian_log_prob(action, mean, scale), p.log_prob(action).sum(-1), atol=1e-5)
+
+
+def test_only_actions_outside_the_box_cost():
+    action = torch.tensor([[[0.5, -1.0]], [[1.5, 0.0]], [[-4.0, 5.0]]])
+    assert action_cost(action).squeeze().tolist() == pytest.approx([0.0, -0.5, -5.0])
+
+
+def test_targets_stop_where_the_return_ends():
+    reward, value = torch.tensor([[1.0, 2.0, 4.0]]), torch.tensor([8.0])
+    assert float(td_target(reward, torch.ones(1, 3), value, 0.5)) == pytest.approx(1 + 1 + 1 + 1)
+    assert float(td_target(reward, torch.tensor([[1.0, 0.0, 1.0]]), value, 0.5)) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("field", ["epsilon", "epsilon_mean", "epsilon_scale"])
+def test_impossible_constraints_are_refused(field):
+    with pytest.raises(ValueError, match=field):
+        MPOConfig(**{field: 0.0})
