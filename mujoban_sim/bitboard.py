@@ -7,7 +7,8 @@ grid: bit 8 (row - 1) + (column - 1) stands for cell (row, column). A *square* i
 
 from __future__ import annotations
 
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Any, Final, cast
 
 import numpy as np
 from llvmlite import ir
@@ -23,6 +24,8 @@ SQUARES: Final = SIDE * SIDE
 
 Bits = np.uint64
 """A set of squares."""
+Int = int | np.integer[Any]
+"""An integer of numba code, where Python's and NumPy's are one."""
 
 NONE: Final = np.uint64(0)
 ONE: Final = np.uint64(1)
@@ -36,34 +39,34 @@ SQUARE_STEP: Final[NDArray[np.int64]] = np.array([-SIDE, 1, SIDE, -1], np.int64)
 """Change of a square's index for a step north, east, south or west; valid only where the step stays on the board."""
 
 
-@intrinsic
-def lowest(typing_context: Any, bits: Any) -> Any:
-    """Return the lowest square of a set that is not empty, int64."""
-
+def _lowest(typing_context: Any, bits: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
     return types.int64(types.uint64), codegen
 
 
-@intrinsic
-def count(typing_context: Any, bits: Any) -> Any:
-    """Return the number of squares in a set, int64."""
-
+def _count(typing_context: Any, bits: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.ctpop(args[0])
 
     return types.int64(types.uint64), codegen
 
 
+lowest = cast(Callable[[Bits], int], intrinsic(_lowest))
+"""Return the lowest square of a set that is not empty; for numba code."""
+count = cast(Callable[[Bits], int], intrinsic(_count))
+"""Return the number of squares in a set; for numba code."""
+
+
 @njit(cache=True, nogil=True, inline="always")
-def bit(square: int) -> Bits:
+def bit(square: Int) -> Bits:
     """Return the set of one square."""
     return ONE << np.uint64(square)
 
 
 @njit(cache=True, nogil=True)
-def shift(bits: Bits, direction: int) -> Bits:
+def shift(bits: Bits, direction: Int) -> Bits:
     """Move a set one square north (0), east (1), south (2) or west (3); what leaves the board is lost."""
     if direction == 0:
         return bits >> _STEP
@@ -121,6 +124,6 @@ def from_grid(grid: NDArray[np.bool_]) -> Bits:
 
 
 @njit(cache=True, nogil=True)
-def to_square(row: int, col: int) -> int:
+def to_square(row: Int, col: Int) -> Int:
     """Return the square of a cell of the grid."""
     return (row - 1) * SIDE + col - 1

@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_sim.bitboard import NONE, SIDE, SQUARES, Bits, bit, count, flood, lowest, shift
+from mujoban_sim.bitboard import NONE, SIDE, SQUARES, Bits, Int, bit, count, flood, lowest, shift
 from mujoban_sim.grid import DIFFICULTIES, GRID_SIZE, OFFSETS_RC
 from mujoban_sim.levels import Level, LevelBatch
 
@@ -49,13 +49,13 @@ _TABLE_BITS: Final = 11
 
 
 @njit(cache=True, nogil=True)
-def _below(rng: np.random.Generator, n: int) -> int:
+def _below(rng: np.random.Generator, n: Int) -> Int:
     """Draw uniformly from 0..n-1; from `random` alone, whose stream NumPy keeps stable."""
     return int(rng.random() * n)
 
 
 @njit(cache=True, nogil=True)
-def _carve_room(rng: np.random.Generator, size: int) -> Bits:
+def _carve_room(rng: np.random.Generator, size: Int) -> Bits:
     """Return the floor that a random walk carves into a grid of `size`, placed as a level text would be."""
     low = (GRID_SIZE - size) // 2
     side = size - 2
@@ -79,7 +79,7 @@ def _carve_room(rng: np.random.Generator, size: int) -> Bits:
 
 
 @njit(cache=True, nogil=True)
-def _random_square(rng: np.random.Generator, bits: Bits) -> int:
+def _random_square(rng: np.random.Generator, bits: Bits) -> Int:
     skip = _below(rng, count(bits))
     for _ in range(skip):
         bits &= bits - np.uint64(1)
@@ -102,8 +102,8 @@ def _insert(table_boxes: NDArray[np.uint64], table_player: NDArray[np.uint64], b
 
 @njit(cache=True, nogil=True)
 def _reverse_play(
-    rng: np.random.Generator, floor: Bits, home: NDArray[np.int64], player: int, boxes_out: NDArray[np.int64]
-) -> int:
+    rng: np.random.Generator, floor: Bits, home: NDArray[np.int64], player: Int, boxes_out: NDArray[np.int64]
+) -> Int:
     """Write the boxes of the hardest visited start to `boxes_out` [K]; return its player square, or -1 if none."""
     k_boxes = len(home)
     targets = NONE
@@ -160,7 +160,7 @@ def _reverse_play(
 @njit(cache=True, nogil=True)
 def _generate(
     rng: np.random.Generator,
-    size: int,
+    size: Int,
     wall: NDArray[np.bool_],
     target: NDArray[np.bool_],
     boxes: NDArray[np.int64],

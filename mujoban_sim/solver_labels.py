@@ -15,6 +15,7 @@ from mujoban_sim.bitboard import (
     SQUARE_STEP,
     SQUARES,
     Bits,
+    Int,
     bit,
     from_grid,
     lowest,
@@ -28,7 +29,7 @@ _UNREACHED = 127
 
 
 @njit(cache=True, nogil=True)
-def walk_distances(goal: int, free: Bits, distance: NDArray[np.int8]) -> None:
+def walk_distances(goal: Int, free: Bits, distance: NDArray[np.int8]) -> None:
     """Write the walking distance of every square of `free` to a goal square, [SQUARES]; `_UNREACHED` elsewhere."""
     distance[:] = _UNREACHED
     frontier = bit(goal)
@@ -45,7 +46,7 @@ def walk_distances(goal: int, free: Bits, distance: NDArray[np.int8]) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _optimal_directions(square: int, free: Bits, distance: NDArray[np.int8]) -> int:
+def _optimal_directions(square: Int, free: Bits, distance: NDArray[np.int8]) -> Int:
     """Return the directions, as bits, that begin a shortest walk from a square."""
     mask = 0
     for direction in range(4):
@@ -56,7 +57,7 @@ def _optimal_directions(square: int, free: Bits, distance: NDArray[np.int8]) -> 
 
 
 @njit(cache=True, nogil=True)
-def _choose(mask: int, rng: np.random.Generator) -> int:
+def _choose(mask: Int, rng: np.random.Generator) -> Int:
     """Return one direction of a mask, uniformly."""
     chosen, options = -1, 0
     for direction in range(4):
@@ -69,7 +70,7 @@ def _choose(mask: int, rng: np.random.Generator) -> int:
 
 @njit(cache=True, nogil=True)
 def moves_of(
-    floor: Bits, boxes: Bits, player: int, pushes: NDArray[np.uint8], rng: np.random.Generator, moves: NDArray[np.int64]
+    floor: Bits, boxes: Bits, player: Int, pushes: NDArray[np.uint8], rng: np.random.Generator, moves: NDArray[np.int64]
 ) -> None:
     """Write the instructions of a solution, walks included, to `moves` [its length]."""
     distance = np.empty(SQUARES, np.int8)
@@ -107,7 +108,7 @@ def search_batch(
     boxes: NDArray[np.int64],
     player: NDArray[np.int64],
     weight: float,
-    max_nodes: int,
+    max_nodes: Int,
     work: Workspace,
     status: NDArray[np.int64],
     length: NDArray[np.int64],

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_sim.bitboard import NONE, ONE, SQUARE_STEP, SQUARES, Bits, bit, count, frozen, lowest, shift, spread
+from mujoban_sim.bitboard import NONE, ONE, SQUARE_STEP, SQUARES, Bits, Int, bit, count, frozen, lowest, shift, spread
 
 SOLVED: Final = 1
 UNSOLVABLE: Final = 2
@@ -118,7 +118,7 @@ def dead_squares(distance: NDArray[np.int64]) -> Bits:
 
 
 @njit(cache=True, nogil=True)
-def assignment(boxes: Bits, distance: NDArray[np.int64], best: NDArray[np.int64]) -> int:
+def assignment(boxes: Bits, distance: NDArray[np.int64], best: NDArray[np.int64]) -> Int:
     """Return the least pushes that assign every box a target of its own; `_INFINITE` or more if there is none.
 
     Args:
@@ -155,7 +155,7 @@ def assignment(boxes: Bits, distance: NDArray[np.int64], best: NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True)
-def _find(work: Workspace, boxes: Bits, player: int) -> int:
+def _find(work: Workspace, boxes: Bits, player: Int) -> Int:
     """Return the table's slot of a state, or the free slot where it belongs."""
     mask = np.uint64(len(work.table) - 1)
     mixed = (boxes ^ (np.uint64(player) * np.uint64(0xD6E8FEB86659FD93))) * np.uint64(0x9E3779B97F4A7C15)
@@ -168,7 +168,7 @@ def _find(work: Workspace, boxes: Bits, player: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _clean(work: Workspace, states: int, buckets: int) -> None:
+def _clean(work: Workspace, states: Int, buckets: Int) -> None:
     """Empty table and queue after a search that used so many of each."""
     for state in range(states):
         work.table[work.slot[state]] = -1
@@ -176,7 +176,7 @@ def _clean(work: Workspace, states: int, buckets: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _read_pushes(work: Workspace, state: int) -> NDArray[np.uint8]:
+def _read_pushes(work: Workspace, state: Int) -> NDArray[np.uint8]:
     """Return the pushes that lead to a state, in order."""
     length, at = 0, state
     while work.parent[at] >= 0:
@@ -192,8 +192,8 @@ def _read_pushes(work: Workspace, state: int) -> NDArray[np.uint8]:
 
 @njit(cache=True, nogil=True)
 def search(
-    floor: Bits, target: Bits, boxes: Bits, player: int, weight: float, max_nodes: int, work: Workspace
-) -> tuple[int, NDArray[np.uint8], int, int]:
+    floor: Bits, target: Bits, boxes: Bits, player: Int, weight: float, max_nodes: Int, work: Workspace
+) -> tuple[Int, NDArray[np.uint8], Int, Int]:
     """Solve a level.
 
     Args:
@@ -232,14 +232,14 @@ def search(
             break
         entry = work.bucket[estimate]
         work.bucket[estimate] = work.entry_next[entry]
-        state = work.entry_state[entry]
+        state = np.int64(work.entry_state[entry])
         cost = np.int64(work.cost[state])
         if work.entry_cost[entry] != cost:
             continue
         if work.bound[state] == 0 and work.boxes[state] == target:
             status, end = SOLVED, state
             break
-        here = work.boxes[state]
+        here = np.uint64(work.boxes[state])
         free = floor & ~here
         landing = free & ~dead
         frontier = bit(np.int64(work.player[state]))
