@@ -1,0 +1,144 @@
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import mujoban_sim  # noqa: F401 - registers the environment
+from mujoban_sim.env import OBSERVATION_SETS, MujobanEnv
+from mujoban_sim.generator import TEST_SEEDS, generate_level
+from mujoban_sim.levels import Level
+from mujoban_sim.vector_env import MujobanVectorEnv
+from mujoban_sim.world import TorqueError
+
+CORRIDOR = "######\n#@$ .#\n######\n"
+
+
+@pytest.mark.parametrize("observations", OBSERVATION_SETS)
+def test_gymnasiums_checker_passes(observations):
+    env = gymnasium.make("Mujoban-v0", observations=observations, render_mode="rgb_array", difficulty=2)
+    with warnings.catch_warnings():
+        # Velocities have no bounds.
+        warnings.filterwarnings("ignore", ".*infinity.*")
+        check_env(env.unwrapped)
+    env.close()
+
+
+def test_observations_have_the_documented_shapes():
+    env = MujobanEnv(observations="privileged", difficulty=3)
+    observation, info = env.reset(seed=3)
+    assert {name: value.shape for name, value in observation.items()} == {
+        "frame": (64, 64, 3), "top_down": (64, 64, 3), "proprio": (16,), "pose": (3,), "velocity": (3,),
+        "box_position": (2, 2), "abstract_state": (10, 10, 4),
+    }  # fmt: skip
+    assert np.array_equal(observation["abstract_state"], generate_level(3, 3).abstract_state())
+    assert info == {"seed": 3, "level": generate_level(3, 3).to_text()}
+    env.close()
+
+
+def test_a_seed_is_an_episode_and_without_one_no_test_level_is_played():
+    env = MujobanEnv(observations="state")
+    first, _ = env.reset(seed=4)
+    drawn = [env.reset()[1]["seed"] for _ in range(3)]
+    assert len(set(drawn)) == 3 and not any(seed in TEST_SEEDS for seed in drawn)
+    again, _ = env.reset(seed=4)
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+    assert [env.reset()[1]["seed"] for _ in range(3)] == drawn
+
+
+def test_solving_terminates_and_the_time_limit_truncates():
+    env = MujobanEnv(observations="state", time_limit=150)
+    for seed in range(100):
+        env.reset(seed=seed, options={"level": CORRIDOR})
+        if abs(env.world.pose[0, 2]) < 0.05:
+            break
+    total, ended = 0.0, False
+    for _ in range(150):
+        _, reward, terminated, truncated, info = env.step(np.array([0.6, -env.world.pose[0, 2]], np.float32))
+        total += reward
+        ended = terminated or truncated
+        if ended:
+            break
+    assert terminated and not truncated and total == 11.0 and info == {"solved": True, "boxes_on_target": 1}
+    env.reset(seed=0)
+    for _ in range(150):
+        _, _, terminated, truncated, _ = env.step(np.zeros(2, np.float32))
+    assert truncated and not terminated
+
+
+def test_levels_come_from_a_file(tmp_path):
+    path = tmp_path / "levels.txt"
+    path.write_text("; 0\n" + CORRIDOR + "\n; 1\n#####\n#@$.#\n#####\n")
+    env = MujobanEnv(level_file=path, observations="state")
+    assert env.reset(seed=2)[1]["level"] == Level.from_text(CORRIDOR).to_text()
+    assert env.reset(seed=3)[1]["level"] != Level.from_text(CORRIDOR).to_text()
+
+
+def test_bad_options_and_actions_are_named():
+    with pytest.raises(ValueError, match=r"difficulty 6.*1, 2, 3, 4, 5"):
+        MujobanEnv(difficulty=6)
+    with pytest.raises(ValueError, match=r"observation set 'all'.*default"):
+        MujobanEnv(observations="all")
+    with pytest.raises(ValueError, match="render_mode 'human'"):
+        MujobanEnv(render_mode="human")
+    env = MujobanEnv(observations="state")
+    env.reset(seed=0)
+    with pytest.raises(TorqueError):
+        env.step(np.array([np.nan, 0.0], np.float32))
+
+
+def test_render_shows_the_grid_from_above():
+    env = MujobanEnv(observations="state", render_mode="rgb_array")
+    env.reset(seed=0)
+    image = env.render()
+    assert image.shape == (256, 256, 3) and image.dtype == np.uint8 and image.std() > 5
+    env.close()
+
+
+def test_vectorised_environments_behave_as_single_ones():
+    options = {"observations": "state", "time_limit": 7, "difficulty": 2}
+    vector = gymnasium.make_vec("Mujoban-v0", 3, vectorization_mode="vector_entry_point", threads=2, **options)
+    singles = [MujobanEnv(**options) for _ in range(3)]
+    observation, _ = vector.reset(seed=5)
+    expected = [env.reset(seed=5 + i)[0] for i, env in enumerate(singles)]
+    ended = [False] * 3
+    rng = np.random.default_rng(0)
+    for _ in range(25):
+        for i, single in enumerate(expected):
+            assert all(np.array_equal(single[name], observation[name][i]) for name in single)
+        actions = rng.uniform(-1, 1, (3, 2)).astype(np.float32)
+        observation, rewards, terminated, truncated, _ = vector.step(actions)
+        for i, env in enumerate(singles):
+            if ended[i]:
+                expected[i], reward, ended[i] = env.reset()[0], 0.0, False
+            else:
+                expected[i], reward, end, cut, _ = env.step(actions[i])
+                ended[i] = end or cut
+            assert reward == rewards[i] and ended[i] == (terminated[i] or truncated[i])
+
+
+def test_same_step_autoreset_hands_over_the_last_observation():
+    env = MujobanVectorEnv(2, observations="state", time_limit=4, autoreset_mode=AutoresetMode.SAME_STEP)
+    env.reset(seed=0)
+    for _ in range(4):
+        observation, _, _, truncated, infos = env.step(np.full((2, 2), 0.3, np.float32))
+    assert truncated.all() and (env.world.steps == 0).all()
+    for i in range(2):
+        assert infos["final_obs"][i]["pose"].shape == (3,)
+        assert not np.array_equal(infos["final_obs"][i]["pose"], observation["pose"][i])
+
+
+def test_disabled_autoreset_resets_where_the_mask_says():
+    env = MujobanVectorEnv(2, observations="state", time_limit=2, autoreset_mode=AutoresetMode.DISABLED)
+    env.reset(seed=0)
+    for _ in range(2):
+        env.step(np.zeros((2, 2), np.float32))
+    with pytest.raises(RuntimeError, match=r"\[0, 1\].*reset"):
+        env.step(np.zeros((2, 2), np.float32))
+    _, infos = env.reset(seed=[8, 9], options={"reset_mask": np.array([False, True])})
+    assert infos["seed"][1] == 9 and not infos["_seed"][0]
+    assert env.world.steps.tolist() == [2, 0]
+    with pytest.raises(ValueError, match="reset_mask"):
+        env.reset(options={"reset_mask": np.zeros(2, bool)})

@@ -1,0 +1,108 @@
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from mujoco.batch import Batch
+
+from mujoban_sim.bodies import BALL
+from mujoban_sim.grid import cell_to_xy
+from mujoban_sim.scene import (
+    BOX_MASS,
+    PHYSICS_STEP,
+    SUBSTEPS,
+    SceneCache,
+    merge_walls,
+    peg_corners,
+    scene_mjcf,
+)
+
+GRIDS = arrays(np.bool_, (10, 10), elements=st.booleans())
+
+
+def closed(wall):
+    wall = wall.copy()
+    wall[[0, -1]] = True
+    wall[:, [0, -1]] = True
+    return wall
+
+
+@given(GRIDS)
+def test_merged_walls_cover_every_wall_cell_once(wall):
+    covered = np.zeros(wall.shape, int)
+    for row, col, last_row, last_col in merge_walls(wall):
+        covered[row : last_row + 1, col : last_col + 1] += 1
+    assert np.array_equal(covered, wall.astype(int))
+
+
+@given(GRIDS)
+def test_a_corner_needs_a_peg_unless_three_walls_meet_there(wall):
+    pegs = {tuple(corner) for corner in peg_corners(wall).tolist()}
+    for row in range(9):
+        for col in range(9):
+            assert ((row, col) in pegs) == (wall[row : row + 2, col : col + 2].sum() < 3)
+
+
+@settings(max_examples=10)
+@given(GRIDS)
+def test_levels_share_one_layout_whatever_their_walls(wall):
+    cache = SceneCache(BALL, 2)
+    first = cache.model(np.zeros((10, 10), bool))
+    checkerboard = np.indices((10, 10)).sum(0) % 2 == 0
+    batch = Batch(first, nsim=3, nthread=1, persistent=True)
+    batch.set_models([cache.model(closed(wall)), cache.model(checkerboard), cache.model(np.ones((10, 10), bool))])
+
+
+def test_the_control_period_is_50_ms():
+    model = mujoco.MjModel.from_xml_string(scene_mjcf(np.zeros((10, 10), bool), 1, BALL))
+    assert model.opt.timestep == PHYSICS_STEP
+    assert pytest.approx(0.05) == SUBSTEPS * PHYSICS_STEP
+
+
+def test_boxes_weigh_25_kg_and_never_turn():
+    model = mujoco.MjModel.from_xml_string(scene_mjcf(np.zeros((10, 10), bool), 3, BALL))
+    for k in range(3):
+        body = model.body(f"box{k}")
+        assert body.mass[0] == pytest.approx(BOX_MASS) == 2.5
+        assert (model.jnt_type[body.jntadr[0] :][:3] == mujoco.mjtJoint.mjJNT_SLIDE).all()
+        assert body.jntnum[0] == 3
+
+
+def test_a_pushed_box_passes_between_pegs_and_stops_at_the_wall():
+    model = mujoco.MjModel.from_xml_string(scene_mjcf(closed(np.zeros((10, 10), bool)), 1, BALL))
+    data = mujoco.MjData(model)
+    data.qpos[:2] = cell_to_xy((4, 2))
+    data.qpos[3:5] = cell_to_xy((8, 8))
+    data.qfrc_applied[0] = 30.0
+    mujoco.mj_step(model, data, round(4.0 / PHYSICS_STEP))
+    assert data.qpos[0] == pytest.approx(4.0 - 0.4, abs=0.02)
+    assert data.qpos[1] == pytest.approx(cell_to_xy((4, 2))[1], abs=0.1)
+
+
+def test_a_box_between_cells_is_held_by_pegs():
+    model = mujoco.MjModel.from_xml_string(scene_mjcf(closed(np.zeros((10, 10), bool)), 1, BALL))
+    data = mujoco.MjData(model)
+    start = cell_to_xy((4, 4)) + np.array([0.0, 0.5])
+    data.qpos[:2] = start
+    data.qpos[3:5] = cell_to_xy((8, 8))
+    data.qfrc_applied[0] = 30.0
+    mujoco.mj_step(model, data, round(4.0 / PHYSICS_STEP))
+    assert data.qpos[0] < start[0] + 0.2
+
+
+def test_scene_cache_compiles_a_level_once_and_drops_the_least_recently_used():
+    cache = SceneCache(BALL, 1, capacity=2)
+    walls = [np.zeros((10, 10), bool) for _ in range(3)]
+    for i, wall in enumerate(walls):
+        wall[i, i] = True
+    first, second = cache.model(walls[0]), cache.model(walls[1])
+    assert cache.model(walls[0]) is first
+    cache.model(walls[2])
+    assert cache.model(walls[0]) is first
+    assert cache.model(walls[1]) is not second
+
+
+def test_walls_of_another_shape_are_rejected():
+    with pytest.raises(ValueError, match=r"\(7, 7\).*\(10, 10\)"):
+        scene_mjcf(np.zeros((7, 7), bool), 1, BALL)
