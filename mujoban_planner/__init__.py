@@ -1,0 +1,38 @@
+"""The planner: abstract state -> instruction (paper C.2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
+    from mujoban_planner.planner import LearnedPlanner
+
+SHIPPED = Path(__file__).parent / "weights" / "planner.safetensors"
+"""The weights that ship."""
+
+
+def load(path: str | Path | None = None, device: str | torch.device = "cpu") -> LearnedPlanner:
+    """Return a planner with trained weights, of the architecture that their record names.
+
+    Args:
+        path: A `.safetensors` file with its record beside; the shipped weights by default.
+        device: Where the network is put.
+
+    Raises:
+        WeightsError: If the weights are missing, damaged, or of no known architecture.
+    """
+    from mujoban_planner.planner import ARCHITECTURES
+    from mujoban_rl.weights import WeightsError, load_weights, read_record
+
+    weights = Path(path or SHIPPED)
+    classes = {cls.__name__: cls for cls in ARCHITECTURES.values()}
+    name = read_record(weights)["class"]
+    if name not in classes:
+        raise WeightsError(f"{weights}: holds weights of {name}, expected one of {', '.join(classes)}")
+    return load_weights(classes[name], weights, device)
+
+
+__all__ = ["SHIPPED", "load"]

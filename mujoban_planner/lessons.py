@@ -1,0 +1,203 @@
+"""What a planner is taught: demonstrations of fresh levels, and corrections of its own play (DAgger).
+
+A `LessonMaker` makes samples in this process; `LessonProcess` runs one beside the training at low priority and hands
+them over through queues.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+from multiprocessing import get_context
+from multiprocessing.queues import Queue
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mujoban_planner.planner import ARCHITECTURES, LearnedPlanner
+from mujoban_planner.play import Boards, Game, play
+from mujoban_planner.samples import Samples, concatenate, take
+from mujoban_planner.teacher import Starts, Teacher, deadly_instruction, starts_of
+from mujoban_rl.weights import WeightsError, load_weights
+from mujoban_sim.generator import TRAIN_SEEDS, generate_batch
+from mujoban_sim.solver_search import UNSOLVABLE
+
+_WALK_SHARE: Final = 0.35
+"""Share of walking states that is kept; pushes decide a level."""
+_PLAY_LIMIT: Final = 90
+_SEEDS_PER_STREAM: Final = 10**12
+
+
+class LessonMaker:
+    """Makes samples from fresh training levels; deterministic given its stream."""
+
+    def __init__(self, stream: int, mix: dict[int, float]) -> None:
+        """Use the training seeds and randomness of `stream` (0, 1, ...).
+
+        Args:
+            stream: Number of this maker; different streams share no level.
+            mix: Share of each difficulty among the levels.
+
+        Raises:
+            ValueError: If the stream has no seeds left in `TRAIN_SEEDS`.
+        """
+        self._next = TRAIN_SEEDS.start + stream * _SEEDS_PER_STREAM
+        if stream < 0 or self._next not in TRAIN_SEEDS:
+            raise ValueError(f"stream {stream}: expected a number whose seeds lie in {TRAIN_SEEDS}")
+        self._rng = np.random.default_rng([stream, 1])
+        self._mix = {d: share / sum(mix.values()) for d, share in mix.items() if share > 0}
+        self._teacher = Teacher()
+
+    def levels(self, n: int) -> list[Boards]:
+        """Return about `n` fresh levels, one part per difficulty."""
+        counts = self._rng.multinomial(n, list(self._mix.values()))
+        parts = []
+        for difficulty, count in zip(self._mix, counts.tolist(), strict=True):
+            if count:
+                seeds = range(self._next, self._next + count)
+                self._next += count
+                batch = generate_batch(difficulty, seeds)
+                parts.append(Boards(batch.wall, batch.target, batch.boxes, batch.player))
+        return parts
+
+    def demonstrations(self, n: int = 256) -> Samples:
+        """Return samples of the solutions of `n` fresh levels, thinned on walks."""
+        parts = [self._teacher.demonstrate(starts_of(b), self._rng)[0] for b in self.levels(n)]
+        samples = concatenate(parts)
+        walking = ~samples.push & (samples.right != 0)
+        return take(samples, ~walking | (self._rng.random(len(walking)) < _WALK_SHARE))
+
+    def corrections(self, planner: LearnedPlanner, n: int = 128) -> Samples:
+        """Let the planner play `n` fresh levels and return what it should have done where it went wrong.
+
+        A lost level is searched for the instruction that lost it; the demonstration starts from the state before.
+        """
+        parts = []
+        for boards in self.levels(n):
+            exploration = 0.05 if self._rng.random() < 0.5 else 0.0
+            game = play(
+                planner, boards, limit=_PLAY_LIMIT, exploration=exploration, rng=self._rng, reduced_precision=True
+            )
+            parts.extend(self._correct(boards, game))
+        return concatenate(parts)
+
+    def _correct(self, boards: Boards, game: Game) -> list[Samples]:
+        batch = np.arange(len(game.moves))
+        length = np.where(game.solved, game.moves, _PLAY_LIMIT)
+        first_dead = self._first_dead(boards, game)
+        lost = first_dead > 0
+        parts = []
+        # Where it went wrong: the state before, what killed it, and a dead state.
+        rows = batch[lost]
+        if rows.size:
+            before = _states(boards, game, rows, first_dead[rows] - 1)
+            parts.append(self._teacher.demonstrate(before, self._rng, trials=1, keep=12)[0])
+            parts.append(deadly_instruction(before, game.instructions[rows, first_dead[rows] - 1]))
+            later = self._rng.integers(first_dead[rows], length[rows] + 1)
+            parts.append(self._teacher.demonstrate(_states(boards, game, rows, later), self._rng)[0])
+        # Anywhere on its way: what it sees that demonstrations do not visit.
+        alive_until = np.where(lost, np.maximum(first_dead - 1, 1), length)
+        somewhere = _states(boards, game, batch, self._rng.integers(0, alive_until))
+        parts.append(self._teacher.demonstrate(somewhere, self._rng, trials=1, keep=8)[0])
+        return parts
+
+    def _first_dead(self, boards: Boards, game: Game) -> NDArray[np.int64]:
+        """Return the first time at which the solver proves each level lost, [B]; -1 where it was never lost."""
+        batch = np.arange(len(game.moves))
+        alive, dead = np.zeros(len(batch), np.int64), np.full(len(batch), _PLAY_LIMIT)
+        open_ = batch[~game.solved]
+        status = self._teacher.judge(_states(boards, game, open_, dead[open_]))
+        lost = open_[status == UNSOLVABLE]
+        while (pending := lost[dead[lost] - alive[lost] > 1]).size:
+            middle = (alive[pending] + dead[pending]) // 2
+            gone = self._teacher.judge(_states(boards, game, pending, middle)) == UNSOLVABLE
+            dead[pending[gone]] = middle[gone]
+            alive[pending[~gone]] = middle[~gone]
+        first = np.full(len(batch), -1)
+        first[lost] = dead[lost]
+        return first
+
+
+def _states(boards: Boards, game: Game, rows: NDArray[np.int64], times: NDArray[np.int64]) -> Starts:
+    """Return the states of levels `rows` before their instruction number `times`."""
+    return starts_of(
+        Boards(boards.wall[rows], boards.target[rows], game.boxes[rows, times], game.player[rows, times])
+    )
+
+
+class LessonProcess:
+    """A `LessonMaker` in a process of its own, which plays with the newest weights that the trainer has written."""
+
+    def __init__(self, stream: int, mix: dict[int, float], architecture: str, weights: Path, niceness: int) -> None:
+        """Start the process; corrections come once `weights` exists."""
+        context = get_context("spawn")
+        self._stop: Event = context.Event()
+        self.demonstrations: Queue[Samples] = context.Queue(maxsize=2)
+        self.corrections: Queue[Samples] = context.Queue(maxsize=2)
+        arguments = (stream, mix, architecture, weights, niceness, self._stop, self.demonstrations, self.corrections)
+        self._process = context.Process(target=_make_lessons, args=arguments, daemon=True)
+        self._process.start()
+
+    def take(self, source: Queue[Samples], wait: bool) -> Samples | None:
+        """Return the next samples of a queue, or None when there are none yet and `wait` is false.
+
+        Raises:
+            RuntimeError: If the process died.
+        """
+        while True:
+            try:
+                return source.get(timeout=1.0) if wait else source.get_nowait()
+            except queue.Empty:
+                if not self._process.is_alive():
+                    raise RuntimeError("the process that makes lessons died; its error stands above") from None
+                if not wait:
+                    return None
+
+    def close(self) -> None:
+        """End the process."""
+        self._stop.set()
+        self._process.join(timeout=2.0)
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join()
+
+
+def _make_lessons(
+    stream: int,
+    mix: dict[int, float],
+    architecture: str,
+    weights: Path,
+    niceness: int,
+    stop: Event,
+    demonstrations: Queue[Samples],
+    corrections: Queue[Samples],
+) -> None:
+    torch.set_num_threads(1)
+    os.nice(niceness)
+    maker = LessonMaker(stream, mix)
+    planner: LearnedPlanner | None = None
+    version = 0.0
+    while not stop.is_set() and os.getppid() != 1:
+        busy = True
+        if not demonstrations.full():
+            demonstrations.put(maker.demonstrations())
+        elif not corrections.full() and weights.exists():
+            if (found := weights.stat().st_mtime) != version:
+                try:
+                    planner, version = load_weights(ARCHITECTURES[architecture], weights), found
+                except WeightsError:  # caught between the two files of a newer version: try again
+                    continue
+            if planner is not None:
+                corrections.put(maker.corrections(planner))
+        else:
+            busy = False
+        if not busy:
+            stop.wait(0.2)
+    demonstrations.cancel_join_thread()
+    corrections.cancel_join_thread()
+
+

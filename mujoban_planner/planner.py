@@ -1,0 +1,340 @@
+"""The planner: abstract state -> instruction (paper C.2).
+
+Two architectures stand behind one class, `LearnedPlanner`:
+
+- `RecurrentPlanner`, the paper's: a repeated ConvLSTM (DRC, Guez et al. 2019), feed-forward in time, with a
+  trainable initial hidden state;
+- `ResidualPlanner`, a residual convolutional network with the same heads.
+
+Shapes: B states, N = `grid.GRID_SIZE`, I = N - 2 (the border of a level is always wall, so the networks see the
+interior alone), C channels, A = 5 instructions, H decisions remembered.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mujoban_planner.decision import VisitMemory, count_visits, initial_visits, remember, visit_penalty
+from mujoban_planner.propagation import PLANES, legal_pushes, propagate, walk_to_push
+from mujoban_planner.symmetry import SYMMETRIES, instruction_permutation, transform_planes
+from mujoban_sim.grid import AGENT, CHANNELS, GRID_SIZE, Instruction
+from mujoban_sim.interfaces import Memory, Planner
+
+INSTRUCTIONS = len(Instruction)
+INTERIOR = GRID_SIZE - 2
+
+
+class PlannerOutput(NamedTuple):
+    """What a network says about abstract states."""
+
+    policy: Tensor
+    """Logits of the instructions, [B, A]."""
+    q: Tensor
+    """Q-value of each instruction in units of reward (paper C.2), [B, A]."""
+    dead: Tensor
+    """Logit of "no solution is left after this instruction", [B, A]; that of STAY judges the state itself."""
+    plan: Tensor
+    """Logits of the plan map, [B, A, I, I]: the direction in which a box will next be pushed out of each cell
+    (STAY: none)."""
+    push: Tensor
+    """Log-probability that the next push is that of the box in each cell in each direction, [B, 4, I, I]."""
+
+
+class LearnedPlanner(nn.Module, Planner):
+    """A planner network with its decision rule.
+
+    The decision is greedy over log pi(A | s) + log(1 - p(dead | s, A)), one forward pass, less a penalty for what
+    was already tried (`decision.visit_penalty`), so that it neither repeats for ever a move that does nothing nor
+    runs in circles. The rule is deterministic; what it remembers is its explicit memory.
+    """
+
+    def __init__(self, *, propagation: bool) -> None:
+        """Take the planes of `propagation.propagate` as further inputs if `propagation`."""
+        super().__init__()
+        self.propagation = propagation
+        self.thinking = 1
+        """Thinking time: repeats of the recurrent core, or symmetric views, per decision; 1 is as trained."""
+        self.caution = 1.0
+        """Weight of the dead-state head in a decision."""
+
+    @property
+    @abstractmethod
+    def config(self) -> dict[str, Any]:
+        """Keyword arguments that rebuild the module."""
+
+    @abstractmethod
+    def features(self, planes: Tensor) -> Tensor:
+        """Return features [B, C, I, I] of the network's input planes, [B, `inputs`, I, I]."""
+
+    @property
+    @abstractmethod
+    def heads(self) -> PlannerHeads:
+        """The read-out."""
+
+    def forward(self, abstract_state: Tensor) -> PlannerOutput:
+        """Return the heads' outputs for abstract states, float [B, N, N, 4] with values in [0, 1]."""
+        planes = input_planes(abstract_state)
+        spread = propagate(planes)
+        inputs = torch.cat([planes, spread], 1) if self.propagation else planes
+        features = self.features(inputs.contiguous(memory_format=torch.channels_last))
+        return self.heads(features, planes, spread[:, 0] if self.propagation else None)
+
+    @property
+    def inputs(self) -> int:
+        """Number of input planes."""
+        return len(CHANNELS) + (PLANES if self.propagation else 0)
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return an empty record of visits for `batch` episodes."""
+        return initial_visits(batch)
+
+    def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
+        """Return an instruction for each state, [M] from [M, N, N, 4], and the next memory.
+
+        Raises:
+            ValueError: If the states have another shape or hold values that are not finite.
+        """
+        check_abstract_state(abstract_state)
+        visits = VisitMemory(*memory)
+        scores = self.scores(abstract_state)
+        decision = np.argmax(scores - visit_penalty(count_visits(abstract_state, visits)), axis=1)
+        return decision, tuple(remember(abstract_state, decision, visits))
+
+    @torch.inference_mode()
+    def scores(self, abstract_state: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return log pi(A | s) + caution * log(1 - p(dead | s, A)), [M, A], before what was tried counts."""
+        device = next(self.parameters()).device
+        states = torch.from_numpy(np.ascontiguousarray(abstract_state, np.float32)).to(device)
+        log_policy, log_alive = self.evaluate(states)
+        return (log_policy + self.caution * log_alive).double().cpu().numpy()
+
+    def evaluate(self, states: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log pi(A | s) and log(1 - p(dead | s, A)), both [B, A], with the thinking time that is set."""
+        output = self(states)
+        return functional.log_softmax(output.policy, 1), functional.logsigmoid(-output.dead)
+
+
+def check_abstract_state(abstract_state: NDArray[np.float32]) -> None:
+    """Raise ValueError unless an abstract state is [M, N, N, 4] and finite."""
+    expected = (GRID_SIZE, GRID_SIZE, len(CHANNELS))
+    if abstract_state.ndim != 4 or abstract_state.shape[1:] != expected:
+        raise ValueError(f"abstract state has shape {abstract_state.shape}, expected (M, *{expected})")
+    if not np.isfinite(abstract_state).all():
+        raise ValueError("abstract state holds values that are not finite, expected probabilities in [0, 1]")
+
+
+def input_planes(abstract_state: Tensor) -> Tensor:
+    """Return the interior as planes (floor, target, agent, box), [B, 4, I, I] from [B, N, N, 4].
+
+    Floor rather than wall, so that the zero padding of a convolution means wall.
+    """
+    planes = abstract_state[:, 1:-1, 1:-1].permute(0, 3, 1, 2)
+    return torch.cat([1.0 - planes[:, :1], planes[:, 1:]], 1)
+
+
+class PlannerHeads(nn.Module):
+    """Policy, Q, dead-state, plan-map and push heads, reading the features at the robot's cell and over the board."""
+
+    def __init__(self, channels: int, *, propagation: bool, hidden: int = 128, squeeze: int = 32) -> None:
+        """Build heads over `channels` features; the board is squeezed to `squeeze` channels per cell.
+
+        With `propagation` the push head chooses among the legal pushes, and the policy reads from it, through a value
+        iteration over the board, which way leads there.
+        """
+        super().__init__()
+        self.squeeze = nn.Conv2d(channels, squeeze, 1)
+        self.board = nn.Linear(squeeze * INTERIOR * INTERIOR + channels, hidden)
+        self.policy = nn.Linear(hidden, INSTRUCTIONS)
+        self.q = nn.Linear(hidden, INSTRUCTIONS)
+        self.dead = nn.Linear(hidden, INSTRUCTIONS)
+        self.plan = nn.Conv2d(channels, INSTRUCTIONS, 1)
+        self.push = nn.Conv2d(channels, INSTRUCTIONS - 1, 1)
+        self.walk = nn.Parameter(torch.tensor([4.0, 8.0])) if propagation else None
+
+    def forward(self, features: Tensor, planes: Tensor, reachable: Tensor | None) -> PlannerOutput:
+        """Return the outputs.
+
+        Args:
+            features: [B, C, I, I].
+            planes: (floor, target, agent, box), [B, 4, I, I].
+            reachable: Where the robot can walk, [B, I, I]; None without propagation.
+        """
+        features = functional.relu(features)
+        here = (features * planes[:, AGENT : AGENT + 1]).sum((2, 3))  # Shape [B, C]
+        board = functional.relu(self.squeeze(features)).flatten(1)
+        hidden = functional.relu(self.board(torch.cat([board, here], 1)))
+        policy, push = self.policy(hidden).float(), self.push(features).float()
+        if reachable is not None:
+            push = push + (legal_pushes(planes, reachable) + 1e-4).log()
+        push = push - push.logsumexp((1, 2, 3), keepdim=True)
+        if self.walk is not None:
+            towards, start = walk_to_push(push.detach().exp(), planes)
+            guide = self.walk[0] * towards + self.walk[1] * start
+            policy = policy + functional.pad(guide, (1, 0))
+        return PlannerOutput(
+            policy, self.q(hidden).float(), self.dead(hidden).float(), self.plan(features).float(), push
+        )
+
+
+class PoolAndInject(nn.Module):
+    """Mean and maximum over the board, mapped to a bias per channel (Guez et al. 2019)."""
+
+    def __init__(self, channels: int, outputs: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(2 * channels, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return [B, outputs, 1, 1] from [B, C, I, I]."""
+        pooled = torch.cat([x.mean((2, 3)), x.amax((2, 3))], 1)
+        return self.linear(pooled)[:, :, None, None]
+
+
+class ResidualBlock(nn.Module):
+    """Pre-activation block without normalisation; its last convolution starts at zero, hence as the identity."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+        self.inject = PoolAndInject(channels, channels)
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(_bias(self.second))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return [B, C, I, I] from [B, C, I, I]."""
+        h = self.first(functional.relu(x))
+        return x + self.second(functional.relu(h + self.inject(h)))
+
+
+class ResidualPlanner(LearnedPlanner):
+    """Residual network over the board. Its thinking time averages over symmetric views of the board."""
+
+    def __init__(self, channels: int = 64, blocks: int = 8, propagation: bool = True) -> None:
+        """Build `blocks` residual blocks of `channels` channels."""
+        super().__init__(propagation=propagation)
+        self._config = {"channels": channels, "blocks": blocks, "propagation": propagation}
+        self.encoder = nn.Conv2d(self.inputs, channels, 3, padding=1)
+        self.blocks = nn.Sequential(*(ResidualBlock(channels) for _ in range(blocks)))
+        self.readout = PlannerHeads(channels, propagation=propagation)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Keyword arguments that rebuild the module."""
+        return dict(self._config)
+
+    @property
+    def heads(self) -> PlannerHeads:
+        """The read-out."""
+        return self.readout
+
+    def features(self, planes: Tensor) -> Tensor:
+        """Return features [B, C, I, I] of planes [B, `inputs`, I, I]."""
+        return self.blocks(self.encoder(planes))
+
+    def evaluate(self, states: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean log pi and log(1 - p(dead)), [B, A], over `thinking` (at most 8) symmetric views."""
+        views = min(max(self.thinking, 1), SYMMETRIES)
+        batch = len(states)
+        seen = torch.cat([transform_planes(states, s) for s in range(views)])
+        parts = [x.unflatten(0, (views, batch)) for x in super().evaluate(seen)]  # Shape [views, B, A]
+        order = torch.stack([instruction_permutation(s, states.device) for s in range(views)])
+        log_policy, log_alive = (x.gather(2, order[:, None].expand_as(x)).mean(0) for x in parts)
+        return log_policy, log_alive
+
+
+class ConvLSTMCell(nn.Module):
+    """ConvLSTM cell with pool-and-inject, tanh output and a residual highway (Guez et al. 2019, appendix).
+
+    What makes it learn quickly: gates that start large enough, forget and output bias +1, and the encoder's part of
+    the gates computed once for all repeats.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.encode = nn.Conv2d(channels, 4 * channels, 3, padding=1)
+        self.gates = nn.Conv2d(2 * channels, 4 * channels, 3, padding=1, bias=False)
+        self.inject = PoolAndInject(channels, 4 * channels)
+        nn.init.normal_(self.encode.weight, 0.0, (9 * channels) ** -0.5)
+        nn.init.normal_(self.gates.weight, 0.0, (18 * channels) ** -0.5)
+        bias = _bias(self.encode)
+        nn.init.zeros_(bias)
+        with torch.no_grad():
+            bias[channels : 3 * channels] += 1.0  # forget and output gates
+
+    def forward(self, encoded: Tensor, below: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the next hidden and cell state, [B, C, I, I].
+
+        Args:
+            encoded: Gate inputs from the encoder, `encode(e)`, [B, 4C, I, I].
+            below: What comes up the highway, [B, C, I, I].
+            hidden: Hidden state, [B, C, I, I].
+            cell: Cell state, [B, C, I, I].
+        """
+        gates = encoded + self.gates(torch.cat([below, hidden], 1)) + self.inject(hidden)
+        enter, forget, leave, value = gates.chunk(4, 1)
+        cell = torch.sigmoid(forget) * cell + torch.sigmoid(enter) * torch.tanh(value)
+        return torch.sigmoid(leave) * torch.tanh(cell), cell
+
+
+class RecurrentPlanner(LearnedPlanner):
+    """The paper's planner: `depth` ConvLSTM layers repeated `repeats` times (DRC), feed-forward in time.
+
+    Hidden states start from a trainable variable and are not carried through time (paper C.2). `thinking` multiplies
+    the repeats at decision time.
+    """
+
+    def __init__(
+        self, channels: int = 32, depth: int = 3, repeats: int = 3, propagation: bool = False
+    ) -> None:
+        """Build DRC(depth, repeats) with `channels` channels."""
+        super().__init__(propagation=propagation)
+        self._config = {"channels": channels, "depth": depth, "repeats": repeats, "propagation": propagation}
+        self.repeats = repeats
+        self.encoder = nn.Sequential(
+            nn.Conv2d(self.inputs, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, channels, 3, padding=1)
+        )
+        self.cells = nn.ModuleList([ConvLSTMCell(channels) for _ in range(depth)])
+        self.initial = nn.Parameter(torch.zeros(depth, 2, channels, INTERIOR, INTERIOR))
+        self.readout = PlannerHeads(channels, propagation=propagation)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Keyword arguments that rebuild the module."""
+        return dict(self._config)
+
+    @property
+    def heads(self) -> PlannerHeads:
+        """The read-out."""
+        return self.readout
+
+    def features(self, planes: Tensor) -> Tensor:
+        """Return features [B, C, I, I] of planes [B, `inputs`, I, I]."""
+        encoded = self.encoder(planes)
+        inputs = [cell.encode(functional.relu(encoded)) for cell in self._cells()]
+        start = self.initial[:, :, None].expand(-1, -1, len(planes), -1, -1, -1).to(encoded.dtype)
+        hidden, memory = list(start[:, 0]), list(start[:, 1])
+        highway = encoded
+        for _ in range(self.repeats * max(self.thinking, 1)):
+            for layer, cell in enumerate(self._cells()):
+                hidden[layer], memory[layer] = cell(inputs[layer], highway, hidden[layer], memory[layer])
+                highway = highway + hidden[layer]
+        return highway
+
+    def _cells(self) -> list[ConvLSTMCell]:
+        return [cell for cell in self.cells if isinstance(cell, ConvLSTMCell)]
+
+
+def _bias(layer: nn.Conv2d) -> nn.Parameter:
+    assert layer.bias is not None
+    return layer.bias
+
+
+ARCHITECTURES: dict[str, type[LearnedPlanner]] = {"residual": ResidualPlanner, "recurrent": RecurrentPlanner}
+"""Architecture by the name that the trainer's configuration uses."""

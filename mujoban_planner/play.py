@@ -1,0 +1,116 @@
+"""Playing levels under the abstract rules with any planner, many levels at once.
+
+Shapes: B levels, K boxes, N = `grid.GRID_SIZE`, T decisions at most.
+"""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mujoban_planner.abstract_env import MOVE_LIMIT
+from mujoban_sim import rules
+from mujoban_sim.grid import AGENT, BOX, CHANNELS, TARGET, WALL
+from mujoban_sim.interfaces import Planner, put_rows, take_rows
+
+
+class Boards(NamedTuple):
+    """States of levels as the rules take them."""
+
+    wall: NDArray[np.bool_]
+    """[B, N, N]."""
+    target: NDArray[np.bool_]
+    """[B, N, N]."""
+    boxes: NDArray[np.int64]
+    """(row, column), [B, K, 2]; negative where absent."""
+    player: NDArray[np.int64]
+    """(row, column), [B, 2]."""
+
+    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Boards:
+        """Return the given rows."""
+        return Boards(*(x[rows] for x in self))
+
+    def abstract_states(self) -> NDArray[np.float32]:
+        """Return s_abst of every level, [B, N, N, 4]."""
+        batch = len(self.player)
+        state = np.zeros((*self.wall.shape, len(CHANNELS)), np.float32)
+        state[..., WALL], state[..., TARGET] = self.wall, self.target
+        state[np.arange(batch), self.player[:, 0], self.player[:, 1], AGENT] = 1.0
+        level, box = np.nonzero(self.boxes[..., 0] >= 0)
+        cells = self.boxes[level, box]
+        state[level, cells[:, 0], cells[:, 1], BOX] = 1.0
+        return state
+
+
+class Game(NamedTuple):
+    """How levels were played."""
+
+    moves: NDArray[np.int64]
+    """Instructions until solved, [B]; -1 where the level was not solved."""
+    instructions: NDArray[np.int64]
+    """Instructions issued, [B, T]; -1 after the end."""
+    decisions: int
+    """Decisions taken altogether."""
+    boxes: NDArray[np.int64]
+    """Boxes before each instruction, [B, T + 1, K, 2]; constant after the end."""
+    player: NDArray[np.int64]
+    """Player before each instruction, [B, T + 1, 2]."""
+
+    @property
+    def solved(self) -> NDArray[np.bool_]:
+        """Whether each level was solved, [B]."""
+        return self.moves >= 0
+
+
+def play(
+    planner: Planner,
+    boards: Boards,
+    *,
+    limit: int = MOVE_LIMIT,
+    exploration: float = 0.0,
+    rng: np.random.Generator | None = None,
+    reduced_precision: bool = False,
+) -> Game:
+    """Let a planner play levels from the given states until solved or for `limit` instructions.
+
+    Args:
+        planner: Any planner; each level is an episode of its own.
+        boards: Starts.
+        limit: T.
+        exploration: Probability of a random move in place of the decision; needs `rng`.
+        rng: Source of exploration.
+        reduced_precision: Run a network in bfloat16, which pays for large batches.
+    """
+    batch = len(boards.player)
+    moves = np.full(batch, -1, np.int64)
+    instructions = np.full((batch, limit), -1, np.int64)
+    box_history = np.repeat(boards.boxes[:, None], limit + 1, axis=1)
+    player_history = np.repeat(boards.player[:, None], limit + 1, axis=1)
+    active = np.arange(batch)
+    memory = planner.initial_state(np.zeros(batch, np.int64)).memory
+    decisions = 0
+    autocast = torch.autocast("cpu", torch.bfloat16) if reduced_precision else nullcontext()
+    for t in range(limit):
+        with autocast:
+            decision, after = planner.decide(boards.abstract_states(), take_rows(memory, active))
+        memory = put_rows(memory, active, after)
+        decisions += len(active)
+        if exploration > 0.0:
+            assert rng is not None
+            chance = rng.random(len(active)) < exploration
+            decision = np.where(chance, rng.integers(1, 5, len(active)), decision)
+        result = rules.apply(*boards, decision)
+        boards = boards._replace(boxes=result.boxes, player=result.player)
+        instructions[active, t] = decision
+        box_history[active, t + 1 :] = result.boxes[:, None]
+        player_history[active, t + 1 :] = result.player[:, None]
+        moves[active[result.solved]] = t + 1
+        going = ~result.solved
+        if not going.any():
+            break
+        active, boards = active[going], boards.take(going)
+    return Game(moves, instructions, decisions, box_history, player_history)

@@ -1,0 +1,98 @@
+"""What spreads over the board by the rules, as input planes: where the robot can walk, where a box can be pushed.
+
+A few convolutions cannot follow a winding way, and learning to do so costs most of a planner's training. These
+planes follow it by a fixed max-min recursion (a value iteration whose transitions are the rules). They know nothing
+of how boxes hinder each other and choose nothing, and they work on probabilities as on certain states.
+
+Shapes: B states, I rows and columns of the interior, D = 4 directions, P = 3 planes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from mujoban_sim.grid import AGENT, BOX, OFFSETS_RC, TARGET
+
+PLANES: Final = 3
+"""Reachable, nearness to the robot, nearness of a lone box to a target."""
+ITERATIONS: Final = 20
+"""Steps that are followed; longer ways than this are rare on an interior of 8 x 8."""
+_DECAY: Final = (1.0, 0.95, 0.9)
+_WALK_DECAY: Final = 0.98
+_DIRECTIONS: Final[list[list[int]]] = OFFSETS_RC[1:].tolist()
+_OPPOSITE: Final = [2, 3, 0, 1]
+
+
+def shifted(board: Tensor) -> Tensor:
+    """Return what each cell's neighbour holds in each direction, [..., D, I, I] from [..., I, I]; 0 outside."""
+    size = board.shape[-1]
+    padded = functional.pad(board, (1, 1, 1, 1))
+    return torch.stack(
+        [padded[..., 1 + row : 1 + row + size, 1 + column : 1 + column + size] for row, column in _DIRECTIONS], -3
+    )
+
+
+def propagate(planes: Tensor) -> Tensor:
+    """Return the three planes, [B, P, I, I] with values in [0, 1].
+
+    Args:
+        planes: (floor, target, agent, box) with values in [0, 1], [B, 4, I, I].
+    """
+    floor, target, agent, box = planes[:, 0], planes[:, TARGET], planes[:, AGENT], planes[:, BOX]
+    free = torch.minimum(floor, 1.0 - box)[:, None].expand(-1, 4, -1, -1)
+    ahead = shifted(floor)  # Shape [B, D, I, I]
+    push = torch.minimum(torch.minimum(ahead, ahead[:, _OPPOSITE]), floor[:, None])
+    mask = torch.stack([free, free, push], 1)  # Shape [B, P, D, I, I]
+    decay = planes.new_tensor(_DECAY)[:, None, None]
+    return _spread(torch.stack([agent, agent, target], 1), mask, decay)
+
+
+def legal_pushes(planes: Tensor, reachable: Tensor) -> Tensor:
+    """Return how certainly the box in each cell can be pushed in each direction now, [B, D, I, I].
+
+    Args:
+        planes: (floor, target, agent, box), [B, 4, I, I].
+        reachable: Where the robot can walk, [B, I, I].
+    """
+    floor, box = planes[:, 0], planes[:, BOX]
+    ahead = shifted(torch.minimum(floor, 1.0 - box))
+    behind = shifted(reachable)[:, _OPPOSITE]
+    return torch.minimum(torch.minimum(ahead, behind), box[:, None])
+
+
+def walk_to_push(push: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
+    """Return which instruction walks towards, and which executes, the pushes that are wanted.
+
+    A value iteration: being where a wanted push starts has value, and value spreads over free cells.
+
+    Args:
+        push: Probability that the box in each cell is to be pushed next in each direction, [B, D, I, I].
+        planes: (floor, target, agent, box), [B, 4, I, I].
+
+    Returns:
+        Steps gained by moving in each direction, clipped to [-1, 1], and the wanted pushes that start here relative to
+        the most wanted one, both [B, D].
+    """
+    floor, agent, box = planes[:, 0], planes[:, AGENT], planes[:, BOX]
+    free = torch.minimum(floor, 1.0 - box)
+    wanted = push / push.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
+    # A push in direction d starts in the cell whose neighbour in direction d holds the box.
+    start = torch.stack([shifted(wanted[:, d])[:, d] for d in range(4)], 1)  # Shape [B, D, I, I]
+    mask = free[:, None, None].expand(-1, 1, 4, -1, -1)
+    value = _spread(torch.minimum(start.amax(1), free)[:, None], mask, push.new_tensor(_WALK_DECAY))[:, 0]
+    nearness = value.clamp(min=1e-6).log() / -math.log(_WALK_DECAY)
+    gain = (shifted(value).clamp(min=1e-6).log() / -math.log(_WALK_DECAY) - nearness[:, None]).clamp(-1.0, 1.0)
+    here = agent[:, None]
+    return (gain * here).sum((2, 3)), (start * here).sum((2, 3))
+
+
+def _spread(value: Tensor, mask: Tensor, decay: Tensor) -> Tensor:
+    """Return values [B, P, I, I] after they spread against each direction where mask [B, P, D, I, I] lets them."""
+    for _ in range(ITERATIONS):
+        value = torch.maximum(value, torch.minimum(mask, shifted(value)).amax(2) * decay)
+    return value
