@@ -39,12 +39,7 @@ class Picture:
     difficulty: int = 5
     """1 to 5."""
     steps: int = 600
-    """Steps of the episode to the last moment, 20 a second."""
-
-    def __post_init__(self) -> None:
-        """Check the arguments."""
-        if self.steps < 4:
-            raise ValueError(f"steps is {self.steps}: expected at least 4")
+    """Steps of the episode to the last moment, at least 4; 20 are a second."""
 
 
 def _scaled(frame: NDArray[np.uint8], size: int) -> Image.Image:
@@ -56,8 +51,10 @@ def draw_picture(config: Picture) -> Image.Image:
 
     Raises:
         RenderingError: if there is no OpenGL.
-        ValueError: if seed or difficulty is out of range.
+        ValueError: if an argument is out of its range.
     """
+    if config.steps < 4:
+        raise ValueError(f"steps is {config.steps}: expected at least 4")
     level = generate_level(config.difficulty, config.seed)
     world = World(1, max_boxes=len(level.boxes))
     world.reset([0], [EpisodeSpec(level, config.seed)])

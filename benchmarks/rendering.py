@@ -1,0 +1,102 @@
+"""Frames per second of the robot's camera, and whole environment steps with camera.
+
+``run`` measures all contestants in turns, several times, so that what else the machine does hits them alike, and
+reports each one's median. ``python -m benchmarks.rendering`` prints it as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable
+
+# mujoco.Renderer takes its OpenGL from what this says when mujoco is first imported.
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import mujoco
+import numpy as np
+
+from mujoban_sim.camera import FRAME_SIZE
+from mujoban_sim.episodes import Episodes
+from mujoban_sim.scene import SceneCache
+from mujoban_sim.world import World
+
+BATCH = 64
+THREADS = 2
+DIFFICULTY = 5
+
+
+def _make_world(threads: int) -> World:
+    episodes = Episodes(BATCH, seed=0, difficulty=DIFFICULTY)
+    world = World(BATCH, max_boxes=episodes.max_boxes, threads=threads)
+    world.reset(np.arange(BATCH), list(episodes))
+    world.render()
+    return world
+
+
+def _default_renderer(world: World) -> Callable[[], int]:
+    """Return a function that draws one frame of the physics scene as MuJoCo does when it is not told how."""
+    model = SceneCache(world.body, world.max_boxes).model(world.wall[0])
+    data = mujoco.MjData(model)
+    data.qpos[:] = world.qpos[0]
+    mujoco.mj_forward(model, data)
+    renderer = mujoco.Renderer(model, FRAME_SIZE, FRAME_SIZE)
+
+    def draw() -> int:
+        renderer.update_scene(data, "first_person")
+        renderer.render()
+        return 1
+
+    return draw
+
+
+def _rate(function: Callable[[], int], seconds: float) -> float:
+    """Return how many units a second a function that returns its units does."""
+    start, count = time.perf_counter(), 0
+    while time.perf_counter() - start < seconds:
+        count += function()
+    return count / (time.perf_counter() - start)
+
+
+def run(seconds: float = 1.0, rounds: int = 5) -> dict[str, float]:
+    """Measure rendering.
+
+    Args:
+        seconds: time for each contestant in each round.
+        rounds: how often each one is measured.
+
+    Returns:
+        Rates per second (medians over the rounds), their ratio to MuJoCo's default renderer, and the machine's load
+        before (1 minute mean of waiting and running processes).
+    """
+    load = os.getloadavg()[0]
+    one, two = _make_world(1), _make_world(THREADS)
+    rng = np.random.default_rng(0)
+
+    def step() -> int:
+        two.step(rng.uniform(-1.0, 1.0, (BATCH, two.body.action_size)).astype(np.float32))
+        return len(two.render())
+
+    contestants: dict[str, Callable[[], int]] = {
+        "default_renderer_frames_per_second": _default_renderer(one),
+        "frames_per_second": lambda: len(one.render()),
+        "frames_per_second_2_threads": lambda: len(two.render()),
+        "steps_with_camera_per_second_2_threads": step,
+    }
+    rates: dict[str, list[float]] = {name: [] for name in contestants}
+    for _ in range(rounds):
+        for name, function in contestants.items():
+            rates[name].append(_rate(function, seconds))
+    result = {name: statistics.median(values) for name, values in rates.items()}
+    start, count = time.process_time(), _rate(contestants["frames_per_second"], seconds) * seconds
+    result["frames_per_cpu_second"] = count / (time.process_time() - start)
+    result["frames_ratio_to_default"] = result["frames_per_second"] / result["default_renderer_frames_per_second"]
+    one.close()
+    two.close()
+    return {**result, "load": load}
+
+
+if __name__ == "__main__":
+    print(json.dumps(run(), indent=2))
