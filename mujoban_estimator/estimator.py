@@ -212,11 +212,9 @@ class StateEstimator(nn.Module, Estimator):
         # Shape [N, D, 10, 10]
         cells = cells.transpose(1, 2).unflatten(2, (GRID_SIZE, GRID_SIZE))
         hidden, belief = self.memory(cells.unflatten(0, (b, t)), belief)
-        logits = self.classify(torch.cat([hidden.flatten(0, 1).to(cells.dtype), cells], dim=1)).float()
-        frame_logits = self.classify_frame(cells).float()
-        return Estimates(
-            logits.permute(0, 2, 3, 1).unflatten(0, (b, t)), frame_logits.permute(0, 2, 3, 1).unflatten(0, (b, t)), belief
-        )
+        logits = self.classify(torch.cat([hidden.flatten(0, 1).to(cells.dtype), cells], dim=1))
+        outputs = (x.float().permute(0, 2, 3, 1).unflatten(0, (b, t)) for x in (logits, self.classify_frame(cells)))
+        return Estimates(*outputs, belief)
 
     def initial_memory(self, batch: int) -> Memory:
         """Return the memory of `batch` robots at the start of an episode."""

@@ -42,7 +42,7 @@ class TerminationNode(ModuleNode):
         super().__init__(**options)
         self._publisher = self.create_output(topics.TERMINATION)
         self._terminated = False
-        self._said: dict[int, Instruction] = {}
+        self._said: dict[int, conversions.InstructionReading] = {}
         for name in _SETTINGS:
             setattr(self.module, name, self.declare_parameter(name, getattr(self.module, name)).value)
         topic = topics.INSTRUCTION
@@ -84,14 +84,19 @@ class TerminationNode(ModuleNode):
         )
         return [Output(self._publisher, message)]
 
-    def _previous(self, stamp: int) -> Instruction | None:
+    def _previous(self, stamp: int) -> conversions.InstructionReading | None:
         """Return the latest instruction before a stamp."""
         earlier = [s for s in self._said if s < stamp]
         return self._said[max(earlier)] if earlier else None
 
     def _on_instruction(self, message: Instruction) -> None:
         stamp = conversions.stamp_of(message)
-        self._said = {s: m for s, m in self._said.items() if stamp - 2 * topics.TICK <= s < stamp} | {stamp: message}
+        try:
+            said = conversions.instruction_from_msg(message)
+        except ValueError as error:
+            self.reject("rejected messages", f"rejected a message on {topics.INSTRUCTION.name}: {error}")
+            return
+        self._said = {s: m for s, m in self._said.items() if stamp - 2 * topics.TICK <= s < stamp} | {stamp: said}
         self.retry()
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
