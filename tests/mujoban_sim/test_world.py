@@ -1,3 +1,4 @@
+import dataclasses
 import subprocess
 import sys
 
@@ -6,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mujoban_sim.bodies import BALL
+from mujoban_sim.bodies import BALL, BODIES, Actuator
 from mujoban_sim.generator import generate_levels
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.grid import AGENT, BOX, TARGET, WALL, Instruction, cell_to_xy, xy_to_cell
 from mujoban_sim.levels import Level
-from mujoban_sim.world import EpisodeSpec, TorqueError, World
+from mujoban_sim.world import EpisodeSpec, TorqueError, World, initial_heading
 
 ROOM = Level.from_text("""\
 ##########
@@ -336,3 +337,44 @@ def test_the_simulation_needs_neither_torch_nor_ros():
         "assert not loaded, loaded\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_another_body_needs_no_more_than_its_description(monkeypatch):
+    mjcf = """
+    <body name="robot" pos="0 0 0.3"><freejoint name="root"/><site name="imu"/><camera name="first_person"/>
+      <geom class="robot" type="box" size="0.4 0.4 0.1" mass="8"/>
+      <body name="arm" pos="0.3 0 0.2"><joint name="arm" type="hinge" axis="0 0 1" damping="1"/>
+        <geom class="robot_visual" type="sphere" size="0.1"/><inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/>
+      </body>
+    </body>"""
+    sled = dataclasses.replace(
+        BALL, name="sled", root="free", joints=("arm",), joint_qpos=(7,), joint_qvel=(6,),
+        actuators=(Actuator("arm", 10.0),), rest_qpos=(0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0, 0.0), cell_size=3.0,
+        time_limit=9600, mjcf=mjcf,
+    )  # fmt: skip
+    monkeypatch.setitem(BODIES, "sled", sled)
+    world = World(2, body="sled", max_boxes=2)
+    world.reset([0, 1], [EpisodeSpec(ROOM, seed) for seed in (7, 8)])
+    assert world.time_limit == 9600
+    assert np.allclose(world.pose[:, :2], 3 * cell_to_xy(START), atol=1e-5)
+    assert np.allclose(world.pose[:, 2], [initial_heading(7), initial_heading(8)], atol=1e-3)
+    assert np.allclose(world.box_position, 3 * cell_to_xy(ROOM.boxes))
+    assert world.agent_cell.tolist() == [list(START)] * 2
+    world.instruct(np.array([Instruction.SOUTH, Instruction.EAST]), np.array([True, True]))
+    assert world.goals.kind.tolist() == [GoalKind.MOVE, GoalKind.PUSH]
+    assert np.allclose(world.goals.box_target[1], 3 * cell_to_xy((3, 5)))
+    for _ in range(20):
+        world.step(np.full((2, 1), 0.5, np.float32))
+    assert world.proprio.shape == (2, 14)
+    # The arm turns, its joint is observed, and the robot stands upright.
+    assert (world.proprio[:, 10] > 0.5).all()
+    assert np.allclose(world.proprio[:, 11:], [0, 0, 1], atol=0.02)
+
+
+def test_a_level_may_have_any_number_of_boxes():
+    rows = ["##########", "#@$$$$$$$#", *["#$$$$$$$$#"] * 3, *["#........#"] * 3, "#....... #", "##########"]
+    level = Level.from_text("\n".join(rows) + "\n")
+    world = World(1, max_boxes=len(level.boxes))
+    world.reset([0], [EpisodeSpec(level, 0)])
+    random_run(world, 50, seed=0)
+    assert np.array_equal(world.box_cell[0], level.boxes)
