@@ -32,7 +32,7 @@ SKYLINE_HEIGHTS: Final = (-0.36, 0.0, 0.32, 0.85)
 """Heights of its rings as tangents of the elevation: ground, horizon, top of the buildings, sky."""
 SKYLINE_V: Final = (0.0, 0.125, 0.875, 1.0)
 """Texture coordinate v at those heights: buildings get most of the texture."""
-_SKYLINE_SEGMENTS: Final = 32
+_SKYLINE_SEGMENTS: Final = 16
 
 
 class Mesh(NamedTuple):
