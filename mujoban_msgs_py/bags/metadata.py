@@ -1,0 +1,175 @@
+"""metadata.yaml of a rosbag2 bag: what files it has and what is in them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from mujoban_msgs_py.bags.errors import BagError
+
+FILE_NAME: Final = "metadata.yaml"
+VERSION: Final = 9
+"""Of the format: that of ROS 2 Jazzy."""
+DISTRIBUTION: Final = "jazzy"
+
+_KEY: Final = "rosbag2_bagfile_information"
+_FOREVER: Final = {"sec": 9223372036, "nsec": 854775807}
+
+
+def qos_profile(*, latched: bool = False, reliable: bool = True, depth: int = 10) -> dict[str, Any]:
+    """Return a QoS profile as bags carry it."""
+    return {
+        "history": "keep_last",
+        "depth": depth,
+        "reliability": "reliable" if reliable else "best_effort",
+        "durability": "transient_local" if latched else "volatile",
+        "deadline": dict(_FOREVER),
+        "lifespan": dict(_FOREVER),
+        "liveliness": "automatic",
+        "liveliness_lease_duration": dict(_FOREVER),
+        "avoid_ros_namespace_conventions": False,
+    }
+
+
+@dataclass
+class TopicRecord:
+    """A topic of a bag."""
+
+    name: str
+    type_name: str
+    type_hash: str
+    qos: list[dict[str, Any]]
+    count: int = 0
+
+
+@dataclass
+class FileRecord:
+    """A file of a bag; times in nanoseconds."""
+
+    path: str
+    start: int = 0
+    end: int = 0
+    count: int = 0
+
+    def add(self, stamp: int) -> None:
+        """Count a message."""
+        self.start = stamp if self.count == 0 else min(self.start, stamp)
+        self.end = max(self.end, stamp)
+        self.count += 1
+
+
+@dataclass
+class Metadata:
+    """What metadata.yaml says."""
+
+    storage: str = "mcap"
+    topics: dict[str, TopicRecord] = field(default_factory=dict)
+    files: list[FileRecord] = field(default_factory=list)
+    compression_mode: str = ""
+
+    def write(self, folder: Path) -> None:
+        """Replace the file in `folder` atomically."""
+        partial = folder / (FILE_NAME + ".partial")
+        with partial.open("w") as stream:
+            yaml.dump({_KEY: self._information()}, stream, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(folder / FILE_NAME)
+
+    @classmethod
+    def read(cls, folder: Path) -> Metadata | None:
+        """Return what the file in `folder` says, or None if there is none.
+
+        Raises:
+            BagError: If it is malformed.
+        """
+        path = folder / FILE_NAME
+        if not path.is_file():
+            return None
+        try:
+            information = yaml.safe_load(path.read_text())[_KEY]
+            topics = [_topic(entry) for entry in information["topics_with_message_count"]]
+            return cls(
+                storage=information["storage_identifier"],
+                topics={topic.name: topic for topic in topics},
+                files=[FileRecord(Path(name).name) for name in information["relative_file_paths"]],
+                compression_mode=(information.get("compression_mode") or "").lower(),
+            )
+        except (yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
+            reason = " ".join(str(error).split())
+            raise BagError(f"{path} is not the metadata of a rosbag2 bag: {type(error).__name__} {reason}") from None
+
+    def _information(self) -> Mapping[str, Any]:
+        filled = [file for file in self.files if file.count]
+        start = min((file.start for file in filled), default=0)
+        end = max((file.end for file in filled), default=0)
+        return {
+            "version": VERSION,
+            "storage_identifier": self.storage,
+            "duration": {"nanoseconds": end - start},
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "message_count": sum(file.count for file in self.files),
+            "topics_with_message_count": [_topic_entry(topic) for topic in self.topics.values()],
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [file.path for file in self.files],
+            "files": [_file_entry(file) for file in self.files],
+            "custom_data": None,
+            "ros_distro": DISTRIBUTION,
+        }
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes every QoS profile out: rosbag2's own parser knows no YAML aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def dump_qos(profiles: Sequence[Mapping[str, Any]]) -> str:
+    """Return QoS profiles as the YAML text that MCAP channels carry."""
+    return yaml.dump([dict(p) for p in profiles], Dumper=_Dumper, sort_keys=False).strip()
+
+
+def load_qos(text: str | Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return QoS profiles from metadata.yaml or an MCAP channel."""
+    profiles = yaml.safe_load(text) if isinstance(text, str) else text
+    return [dict(p) for p in profiles or []]
+
+
+def _topic(entry: Mapping[str, Any]) -> TopicRecord:
+    told = entry["topic_metadata"]
+    return TopicRecord(
+        name=told["name"],
+        type_name=told["type"],
+        type_hash=told.get("type_description_hash", ""),
+        qos=load_qos(told.get("offered_qos_profiles", [])),
+        count=entry["message_count"],
+    )
+
+
+def _topic_entry(topic: TopicRecord) -> dict[str, Any]:
+    return {
+        "topic_metadata": {
+            "name": topic.name,
+            "type": topic.type_name,
+            "serialization_format": "cdr",
+            "offered_qos_profiles": topic.qos,
+            "type_description_hash": topic.type_hash,
+        },
+        "message_count": topic.count,
+    }
+
+
+def _file_entry(file: FileRecord) -> dict[str, Any]:
+    return {
+        "path": file.path,
+        "starting_time": {"nanoseconds_since_epoch": file.start},
+        "duration": {"nanoseconds": file.end - file.start},
+        "message_count": file.count,
+    }

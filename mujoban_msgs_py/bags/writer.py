@@ -1,0 +1,183 @@
+"""Write rosbag2 bags in MCAP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Final, Self
+
+from mcap.writer import CompressionType, Writer
+
+from mujoban_msgs_py.bags.errors import BagError
+from mujoban_msgs_py.bags.metadata import FileRecord, Metadata, TopicRecord, dump_qos, qos_profile
+from mujoban_msgs_py.bags.types import TypeRegistry
+from mujoban_msgs_py.topics import Topic
+
+CHUNK_SIZE: Final = 1 << 20
+"""Bytes of a chunk before compression: what a killed recorder can lose."""
+PROFILE: Final = "ros2"
+
+_COMPRESSION: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
+
+
+class BagWriter:
+    """A bag of MCAP files with chunk and file checksums, and one file per so many episodes.
+
+    metadata.yaml exists from the first message on. Of a writer that is killed all whole chunks can be read:
+    see `open_bag` and `recover_bag`.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        topics: Iterable[Topic] = (),
+        *,
+        episodes_per_file: int | None = None,
+        chunk_size: int = CHUNK_SIZE,
+        compression: str = "zstd",
+    ) -> None:
+        """Make the bag's folder and open its first file.
+
+        Args:
+            path: The folder to make.
+            topics: What is recorded; `add_topic` adds others.
+            episodes_per_file: Calls of `end_episode` after which a new file is begun; None means one file.
+            chunk_size: Bytes of a chunk before compression.
+            compression: Of chunks: "zstd", "lz4" or "" for none.
+
+        Raises:
+            BagError: If there is something at `path` already, or an option is out of its range.
+        """
+        if compression not in _COMPRESSION:
+            raise BagError(f"compression must be 'zstd', 'lz4' or '', got {compression!r}")
+        for name, value in (("episodes_per_file", episodes_per_file), ("chunk_size", chunk_size)):
+            if value is not None and value < 1:
+                raise BagError(f"{name} must be at least 1, got {value}")
+        self.path = Path(path)
+        self._episodes_per_file = episodes_per_file
+        self._chunk_size = chunk_size
+        self._compression = _COMPRESSION[compression]
+        self._types = TypeRegistry()
+        self._metadata = Metadata()
+        self._episodes = 0
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._stream: BinaryIO | None = None
+        try:
+            self.path.mkdir(parents=True)
+        except FileExistsError:
+            raise BagError(f"{self.path} exists already: a bag needs a new folder") from None
+        self._open_file()
+        for topic in topics:
+            self.add_topic(topic.name, topic.type_name, [qos_profile(latched=topic.latched)])
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages written, by topic."""
+        return {topic.name: topic.count for topic in self._metadata.topics.values()}
+
+    def add_topic(self, name: str, type_name: str, qos: Sequence[Mapping[str, Any]] = ()) -> None:
+        """Add a topic of a ROS type such as `std_msgs/msg/Header`; known ones stay as they are.
+
+        Raises:
+            BagError: If the type is unknown, or the topic is in the bag with another type.
+        """
+        known = self._metadata.topics.get(name)
+        if known is not None:
+            if known.type_name != type_name:
+                raise BagError(f"topic {name} of {self.path} is of type {known.type_name}, not {type_name}")
+            return
+        profiles = [dict(p) for p in qos] or [qos_profile()]
+        record = TopicRecord(name, type_name, self._types.type_hash(type_name), profiles)
+        self._metadata.topics[name] = record
+        self._register(record)
+        self._metadata.write(self.path)
+
+    def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
+        """Write one serialised message.
+
+        Args:
+            topic: Its topic, which has been added.
+            stamp: Log time in nanoseconds; simulated time in bags of the graph.
+            data: The message in CDR, as raw subscriptions deliver it.
+            published: Publication time in nanoseconds; None means `stamp`.
+
+        Raises:
+            BagError: If the topic is unknown or the bag is closed.
+        """
+        channel = self._channels.get(topic)
+        if channel is None or self._stream is None:
+            reason = "is closed" if self._stream is None else f"has no topic {topic!r}"
+            raise BagError(f"cannot write to {self.path}: it {reason}")
+        record = self._metadata.topics[topic]
+        self._writer.add_message(channel, stamp, data, stamp if published is None else published, record.count)
+        record.count += 1
+        self._metadata.files[-1].add(stamp)
+
+    def end_episode(self) -> None:
+        """Note that an episode is complete; after `episodes_per_file` of them a new file is begun."""
+        self._episodes += 1
+        if self._episodes_per_file is not None and self._episodes % self._episodes_per_file == 0:
+            self.split()
+
+    def split(self) -> None:
+        """Finish the file and begin the next one, unless the file is still empty."""
+        if self._metadata.files[-1].count:
+            self._close_file()
+            self._open_file()
+
+    def flush(self) -> None:
+        """Finish the chunk in progress, so that a reader can see everything written so far."""
+        if self._stream is not None:
+            self._writer.flush()
+
+    def close(self) -> None:
+        """Finish the last file and metadata.yaml; a second call does nothing."""
+        if self._stream is None:
+            return
+        self._close_file()
+        if len(self._metadata.files) > 1 and not self._metadata.files[-1].count:
+            (self.path / self._metadata.files.pop().path).unlink()
+        self._metadata.write(self.path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _open_file(self) -> None:
+        file = FileRecord(f"{self.path.name}_{len(self._metadata.files)}.mcap")
+        # A buffer smaller than any record: what is written has left the process, should it be killed.
+        self._stream = (self.path / file.path).open("xb", buffering=2)
+        self._writer = Writer(
+            self._stream,
+            chunk_size=self._chunk_size,
+            compression=self._compression,
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        self._writer.start(profile=PROFILE)
+        self._channels, self._schemas = {}, {}
+        self._metadata.files.append(file)
+        for topic in self._metadata.topics.values():
+            self._register(topic)
+        self._metadata.write(self.path)
+
+    def _close_file(self) -> None:
+        assert self._stream is not None
+        self._writer.finish()
+        self._stream.close()
+        self._stream = None
+
+    def _register(self, topic: TopicRecord) -> None:
+        if topic.type_name not in self._schemas:
+            text = self._types.definition(topic.type_name)
+            self._schemas[topic.type_name] = self._writer.register_schema(topic.type_name, "ros2msg", text.encode())
+        details = {"offered_qos_profiles": dump_qos(topic.qos), "topic_type_hash": topic.type_hash}
+        self._channels[topic.name] = self._writer.register_channel(
+            topic.name, "cdr", self._schemas[topic.type_name], details
+        )
