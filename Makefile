@@ -1,0 +1,37 @@
+# make setup  .venv with everything in it          make lint   ruff and pyright
+# make run    one episode with a live view         make bench  measurements, as JSON
+# make test   the test suite
+#
+# PYTHON chooses the interpreter for .venv; ARGS are passed on, as in: make run ARGS="--difficulty 1"
+
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+INPUTS := pyproject.toml setup.py mujoban_msgs_py/interface_build.py $(wildcard mujoban_msgs_py/msg/*.msg)
+ARGS ?=
+
+.PHONY: setup run test lint bench clean
+
+setup: $(STAMP)
+
+$(STAMP): $(INPUTS) bringup/check_machine.py
+	@$(PYTHON) bringup/check_machine.py
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@
+
+run: $(STAMP)
+	$(BIN)/python bringup/run_stack.py $(ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+bench: $(STAMP)
+	$(BIN)/python -m benchmarks $(ARGS)
+
+clean:
+	rm -rf .venv build mujoban_msgs mujoban.egg-info
