@@ -22,7 +22,7 @@ TRUTH_INPUTS = (
     Input(topics.TRUE_POSE, conversions.pose_from_msg),
     Input(topics.TRUE_TWIST, conversions.twist_from_msg),
     Input(topics.TRUE_BOXES, conversions.boxes_from_msg),
-    Input(topics.TRUE_TERMINATION, lambda message: message.terminated),
+    Input(topics.TRUE_TERMINATION, lambda message: conversions.termination_from_msg(message).terminated),
 )
 """What a privileged module receives besides, in the order of `GroundTruth`."""
 
@@ -40,6 +40,7 @@ class ModuleNode(TickNode):
 
     role: ClassVar[str]
     inputs: ClassVar[Sequence[Input]]
+    truth_inputs: ClassVar[Sequence[Input]] = TRUTH_INPUTS
 
     def __init__(self, **options: Any) -> None:
         """Load the module and start listening.
@@ -55,7 +56,8 @@ class ModuleNode(TickNode):
         self.state: Any = None
         self._episode = -1
         self.add_on_set_parameters_callback(self._on_parameters)
-        self.open_inputs([*self.inputs, *(TRUTH_INPUTS if self.module.privileged else ())])
+        self._truth = self.truth_inputs if self.module.privileged else ()
+        self.open_inputs([*self.inputs, *self._truth])
 
     @abstractmethod
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
@@ -74,8 +76,8 @@ class ModuleNode(TickNode):
             self._episode = episode.episode
             self.begin(episode, inputs)
         truth = None
-        if self.module.privileged:
-            truth = GroundTruth(*(np.asarray(inputs[i.topic.name])[None] for i in TRUTH_INPUTS))
+        if self._truth:
+            truth = GroundTruth(*(np.asarray(inputs[i.topic.name])[None] for i in self._truth))
         return self.step(episode, inputs, truth)
 
     def _load(self, weights: str, device: str) -> Any:

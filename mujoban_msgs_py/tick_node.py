@@ -17,20 +17,21 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import rclpy
+from mujoban_msgs.msg import Episode
 from rclpy.executors import ExternalShutdownException
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from mujoban_msgs.msg import Episode
 from mujoban_msgs_py.conversions import stamp_of
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import EPISODE, Topic
 
 LOG_PERIOD = 5.0
-"""Seconds between two reports of bad input from one node."""
-HELD_TICKS = 8
-"""Unfinished ticks whose messages are kept."""
+"""Seconds between two reports of bad input from one place."""
+PATIENCE = 2
+"""Repeated offers of a tick after which a node answers without what it still waits for."""
 
 
 class Input(NamedTuple):
@@ -75,10 +76,14 @@ class TickNode(Node):
 
     def open_inputs(self, inputs: Sequence[Input]) -> None:
         """Subscribe to `/episode` and to what `answer` needs besides."""
-        every = [Input(EPISODE, _as_it_is), *inputs]
-        self._join = Synchroniser([i.topic.name for i in every], depth=HELD_TICKS)
+        every = [Input(EPISODE, as_it_is), *inputs]
+        self._join = Synchroniser([i.topic.name for i in every])
         for topic, decode in every:
             self.create_subscription(topic.type, topic.name, partial(self._receive, topic, decode), topic.qos)
+
+    def create_output(self, topic: Topic) -> Publisher:
+        """Return a publisher of a topic."""
+        return self.create_publisher(topic.type, topic.name, topic.qos)
 
     def retry(self) -> None:
         """Ask `answer` again about the tick that it could not answer yet."""
@@ -86,7 +91,7 @@ class TickNode(Node):
             return
         stamp, inputs = self._open
         episode = inputs[EPISODE.name]
-        outputs = self.answer(stamp, episode, inputs, insist=self._offers > MAX_PATIENCE)
+        outputs = self.answer(stamp, episode, inputs, insist=self._offers > PATIENCE)
         if outputs is None:
             return
         self._open, self._handled, self._outputs = None, stamp, outputs
@@ -111,7 +116,9 @@ class TickNode(Node):
         assert self._join is not None
         complete = self._join.add(topic.name, stamp, item)
         if complete is not None:
-            self._open, self._offers = (stamp, complete), 0
+            # Where time does not wait, a tick that is still open has lost its chance, and so has what it waits for.
+            self._offers = 0 if self._open is None else PATIENCE + 1
+            self._open = (stamp, complete)
             self.retry()
 
     def _note_offer(self, stamp: int, episode: Episode) -> None:
@@ -130,12 +137,14 @@ class TickNode(Node):
             publisher.publish(message)
 
 
-MAX_PATIENCE = 2
-"""Repeated offers of a tick after which a node answers without what it waits for."""
-
-
-def _as_it_is(message: Any) -> Any:
+def as_it_is(message: Any) -> Any:
+    """Return the message: the `decode` of inputs that need none."""
     return message
+
+
+def live_qos(depth: int = 64) -> QoSProfile:
+    """Return the QoS of a reader that wants nothing from before its time, and after that everything."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 
 
 def confine_discovery() -> None:

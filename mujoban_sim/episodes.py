@@ -42,6 +42,7 @@ class Episodes(Sequence[EpisodeSpec]):
             raise ValueError(f"seed {seed} is negative: expected an integer from 0")
         if count is not None and count < 1:
             raise ValueError(f"{count} episodes: expected at least 1")
+        self.level_file = level_file
         self.levels = None if level_file is None else tuple(read_levels(level_file))
         self.seed = seed
         self._difficulty = difficulty

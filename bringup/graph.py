@@ -1,0 +1,115 @@
+"""Start the nodes of the graph: all in this process on one executor, or each in a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from bringup.command import USAGE_ERROR
+from bringup.parameters import Parameters, write_parameters
+from mujoban_controller.node import ControllerNode
+from mujoban_estimator.node import EstimatorNode
+from mujoban_estimator.termination_node import TerminationNode
+from mujoban_planner.node import PlannerNode
+from mujoban_sim.node import SimulatorNode
+
+NODES: dict[str, type[Node]] = {
+    "simulator": SimulatorNode,
+    "estimator": EstimatorNode,
+    "termination": TerminationNode,
+    "planner": PlannerNode,
+    "controller": ControllerNode,
+}
+"""The nodes of the graph by name."""
+
+RESPAWN_PERIOD = 0.1
+"""Seconds between two looks at whether the processes live."""
+STOP_TIMEOUT = 5.0
+"""Seconds that a process has to end when it is asked to."""
+
+
+class GraphError(RuntimeError):
+    """A node of the graph could not start; it has said why."""
+
+
+def make_node(name: str, parameters: dict[str, Any], context: Context | None = None) -> Node:
+    """Return a node of the graph with the given parameters.
+
+    Raises:
+        ValueError: If a parameter or what it names is bad.
+    """
+    overrides = [Parameter(key, value=value) for key, value in parameters.items()]
+    return NODES[name](parameter_overrides=overrides, context=context)
+
+
+class Processes:
+    """One process for each node; those that end are started again.
+
+    Attributes:
+        restarts: How often each node was started again.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        """Start the nodes with these parameters."""
+        self.restarts: Counter[str] = Counter()
+        self._directory = tempfile.TemporaryDirectory(prefix="mujoban-")
+        folder = Path(self._directory.name)
+        # A simulator that is started again has to know where it was.
+        parameters["simulator"]["progress_file"] = str(folder / "progress.json")
+        self._parameter_file = folder / "parameters.yaml"
+        write_parameters(parameters, self._parameter_file)
+        self._children = {name: self._start(name) for name in NODES}
+
+    def __enter__(self) -> Processes:
+        """Return these processes."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Stop them."""
+        self.stop()
+
+    def pid(self, name: str) -> int:
+        """Return the process id of a node."""
+        return self._children[name].pid
+
+    def supervise(self) -> None:
+        """Start again what has ended.
+
+        Raises:
+            GraphError: If a node ended because its input is bad.
+        """
+        for name, child in self._children.items():
+            status = child.poll()
+            if status is None:
+                continue
+            if status == USAGE_ERROR:
+                raise GraphError(f"the {name} node could not start")
+            self.restarts[name] += 1
+            self._children[name] = self._start(name)
+
+    def stop(self) -> None:
+        """End all processes."""
+        for child in self._children.values():
+            child.terminate()
+        deadline = time.monotonic() + STOP_TIMEOUT
+        for child in self._children.values():
+            try:
+                child.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+        self._directory.cleanup()
+
+    def _start(self, name: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", NODES[name].__module__, "--ros-args"]
+        return subprocess.Popen([*command, "--params-file", str(self._parameter_file)])

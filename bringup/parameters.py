@@ -1,0 +1,63 @@
+"""The parameters that the nodes of a graph are started with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from bringup.command import Stack
+from mujoban_sim.episodes import Episodes
+from mujoban_sim.plugins import ROLES
+
+DEFAULTS = Path(__file__).parent / "config" / "stack.yaml"
+
+Parameters = dict[str, dict[str, Any]]
+"""Node -> parameter -> value."""
+
+
+def read_parameters(path: Path = DEFAULTS) -> Parameters:
+    """Return the parameters of a ROS 2 parameter file.
+
+    Raises:
+        ValueError: If it is none.
+        OSError: If it cannot be read.
+    """
+    try:
+        content = yaml.safe_load(path.read_text())
+        return {node.lstrip("/"): dict(entry["ros__parameters"]) for node, entry in content.items()}
+    except (yaml.YAMLError, AttributeError, TypeError, KeyError) as error:
+        raise ValueError(f"{path}: not a ROS 2 parameter file (node: ros__parameters: ...): {error}") from error
+
+
+def write_parameters(parameters: Parameters, path: Path) -> None:
+    """Write a ROS 2 parameter file."""
+    path.write_text(yaml.safe_dump({node: {"ros__parameters": values} for node, values in parameters.items()}))
+
+
+def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Parameters:
+    """Return the parameters of a graph that plays some episodes with some modules.
+
+    Args:
+        stack: The modules.
+        episodes: The episodes.
+        **simulator: Further parameters of the simulator.
+    """
+    parameters = read_parameters()
+    parameters["simulator"] |= {
+        "seed": episodes.seed,
+        "episodes": len(episodes),
+        "level_file": "" if episodes.level_file is None else str(episodes.level_file),
+        **simulator,
+    }
+    if episodes.level_file is None:
+        parameters["simulator"]["difficulty"] = episodes.difficulty
+    for role in ROLES:
+        choice = stack.choices[role]
+        parameters[role] |= {
+            "module": choice.source,
+            "weights": "" if choice.weights is None else str(choice.weights),
+            "device": stack.device,
+        }
+    return parameters

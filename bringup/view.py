@@ -1,0 +1,95 @@
+"""The live terminal view: instruction, estimate and ground truth side by side, and the summary table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from mujoban_msgs.msg import Episode
+from numpy.typing import NDArray
+from rich.columns import Columns
+from rich.console import Group, RenderableType
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from bringup.monitor import Watched
+from bringup.results import EpisodeResult
+from mujoban_sim.grid import AGENT, BOX, CONTROL_PERIOD, TARGET, WALL, Instruction
+
+ARROWS = {
+    Instruction.STAY: "●",
+    Instruction.NORTH: "↑",
+    Instruction.EAST: "→",
+    Instruction.SOUTH: "↓",
+    Instruction.WEST: "←",
+}
+
+
+def grid_text(state: NDArray[np.float32]) -> Text:
+    """Draw an abstract state, [N, N, 4], two characters a cell; cells of which it is unsure are dim."""
+    text = Text()
+    agent = int(np.argmax(state[..., AGENT]))
+    size = state.shape[1]
+    for index in range(state.shape[0] * size):
+        cell = state[index // size, index % size]
+        glyph, style = _glyph(cell, index == agent)
+        layers = cell[[WALL, TARGET, BOX]]
+        unsure = bool((np.abs(layers - 0.5) < 0.35).any())
+        text.append(glyph, f"{style} dim" if unsure else style)
+        if index % size == size - 1:
+            text.append("\n")
+    text.rstrip()
+    return text
+
+
+def _glyph(cell: NDArray[np.float32], agent: bool) -> tuple[str, str]:
+    wall, target, box = (bool(cell[layer] > 0.5) for layer in (WALL, TARGET, BOX))
+    if agent:
+        return "@ ", "bold cyan on red" if target else "bold cyan"
+    if wall:
+        return "██", "bright_black"
+    if box:
+        return "■ ", "bold blue on green" if target else "bold yellow"
+    return ("· ", "red") if target else ("  ", "")
+
+
+def live_view(episode: Episode | None, tick: Watched | None, outcomes: Sequence[EpisodeResult]) -> RenderableType:
+    """Return what the terminal shows of the latest tick."""
+    if episode is None or tick is None:
+        return Text("waiting for the graph ...")
+    said = tick.instruction
+    facts = Table.grid(padding=(0, 2))
+    for name, value in (
+        ("episode", f"{episode.episode} (seed {episode.seed})"),
+        ("difficulty", str(episode.difficulty) if episode.difficulty else "level file"),
+        ("time", f"{episode.step * CONTROL_PERIOD:.1f} s, step {episode.step}"),
+        ("return", f"{episode.episode_return:+.0f}"),
+        ("on target", str(episode.boxes_on_target)),
+        ("solved", f"{sum(r.solved for r in outcomes)} of {len(outcomes)}"),
+        ("termination", f"p = {tick.termination.probability:.2f}"),
+    ):
+        facts.add_row(Text(name, "bright_black"), value)
+    arrow = Text(f"{ARROWS[Instruction(said.direction)]}  {Instruction(said.direction).name.lower()}", "bold green")
+    arrow.append(f"   number {said.sequence}", "bright_black")
+    return Columns(
+        [
+            Panel(Group(arrow, Text(), facts), title="instruction", height=12, width=34),
+            Panel(grid_text(tick.estimate), title="estimate", height=12, width=24),
+            Panel(grid_text(tick.truth), title="ground truth", height=12, width=24),
+        ]
+    )
+
+
+def summary(results: Sequence[EpisodeResult]) -> Table:
+    """Return the table of outcomes."""
+    table = Table(title="Episodes")
+    for name in ("seed", "outcome", "return", "steps", "instructions", "time-outs", "wrong estimates"):
+        table.add_column(name, justify="left" if name == "outcome" else "right")
+    for r in results:
+        outcome = Text("solved", "green") if r.solved else Text(str(r.failure), "red")
+        table.add_row(
+            str(r.seed), outcome, f"{r.episode_return:+.0f}", str(r.steps), str(r.instructions), str(r.time_outs),
+            str(r.wrong_estimates),
+        )  # fmt: skip
+    return table

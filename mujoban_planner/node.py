@@ -1,0 +1,55 @@
+"""The planner's node: estimate of s_abst, beta -> A (`python -m mujoban_planner.node`)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from mujoban_msgs.msg import Episode
+
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.module_node import ModuleNode
+from mujoban_msgs_py.tick_node import Input, Output, run_node
+from mujoban_sim.interfaces import GroundTruth
+
+
+class PlannerNode(ModuleNode):
+    """Publishes `/instruction` in every tick; parameters as in `ModuleNode`."""
+
+    role = "planner"
+    inputs = (
+        Input(topics.ABSTRACT_STATE, conversions.abstract_state_from_msg),
+        Input(topics.TERMINATION, conversions.termination_from_msg),
+    )
+    truth_inputs = ()
+    """A planner, also the oracle, goes by the abstract state that it is given."""
+
+    def __init__(self, **options: Any) -> None:
+        """Load the module and start listening."""
+        super().__init__(**options)
+        self._publisher = self.create_output(topics.INSTRUCTION)
+
+    def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
+        """Start the state; a planner that joins an episode goes on with the numbers of its predecessor."""
+        super().begin(episode, inputs)
+        issued = inputs[topics.TERMINATION.name].sequence
+        if episode.step > 0:
+            self.state = self.state._replace(sequence=np.array([issued], np.int64))
+
+    def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
+        """Hold the instruction in force or decide on a new one."""
+        terminated = np.array([inputs[topics.TERMINATION.name].terminated])
+        instruction, self.state = self.module.step(inputs[topics.ABSTRACT_STATE.name][None], terminated, self.state)
+        message = conversions.instruction_to_msg(episode.header, self.state.sequence[0], instruction[0])
+        return [Output(self._publisher, message)]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(PlannerNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

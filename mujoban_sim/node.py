@@ -1,0 +1,339 @@
+"""The simulator node: publishes o_t, waits for A_t and a_t, and steps the world (`python -m mujoban_sim.node`)."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mujoban_msgs.msg import Instruction
+from numpy.typing import NDArray
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool, Trigger
+
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.observation import ObservationPublisher, TickLabel
+from mujoban_msgs_py.tick_node import LOG_PERIOD, live_qos, run_node
+from mujoban_msgs_py.topics import TICK
+from mujoban_sim.episodes import Episodes
+from mujoban_sim.grid import CONTROL_PERIOD, DIFFICULTIES
+from mujoban_sim.world import World
+
+MATCH_PERIOD = 0.02
+"""Seconds between two looks at whether the graph is complete."""
+
+PARAMETERS: dict[str, Any] = {
+    "seed": 0,
+    "episodes": 0,
+    "difficulty": max(DIFFICULTIES),
+    "level_file": "",
+    "time_limit": 0,
+    "body": "ball",
+    "realtime": 0.0,
+    "resend_after": 0.5,
+    "await_recorder": False,
+    "top_camera_size": 256,
+    "progress_file": "",
+}
+"""Parameters of the simulator and their defaults."""
+
+
+class Progress(NamedTuple):
+    """What a simulator that is started again has to know."""
+
+    index: int = 0
+    """Episode of the run that is being played."""
+    starts: int = 0
+    """Episodes started so far: the number of the episode in its messages."""
+    stamp: int = 0
+    """Simulated time before the episode's first tick [ns]."""
+
+
+class SimulatorNode(Node):
+    """Plays episodes, in lockstep with the graph or in real time.
+
+    In lockstep the world steps when the torque and the instruction of the current stamp have arrived, so a run
+    is deterministic. In real time it steps when the clock says so, and holds the latest torque.
+
+    Parameters:
+        seed, episodes, difficulty, level_file: Which episodes are played, see `mujoban_sim.episodes.Episodes`;
+            `episodes` 0 means as many as a level file has, else one.
+        time_limit: Steps of an episode; 0 means that of the body.
+        body: The robot's body.
+        realtime: Simulated seconds per second; 0 is lockstep.
+        resend_after: Seconds without an answer after which a tick is offered again in lockstep.
+        await_recorder: Whether in lockstep a recorder must have acknowledged a tick before the next.
+        top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
+        progress_file: Where the node keeps what it plays, so that it starts the same episode again after it was
+            killed; empty means nowhere.
+
+    Services: `/reset` starts the episode again, `/pause` (true or false) holds the world, `/step` advances a held
+    world by one tick.
+
+    Attributes:
+        counts: Events that a user should know of: late answers, rejected torques and so on.
+        finished: Done when the last episode has ended.
+        ticks: Steps of the world so far.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        """Read the parameters and make the world; the first tick follows once the graph is complete.
+
+        Raises:
+            ValueError: If a parameter is out of its range or the level file is malformed.
+            OSError: If the level file cannot be read.
+        """
+        super().__init__("simulator", **options)
+        self.counts: Counter[str] = Counter()
+        self.finished: Future[None] = Future()
+        self.ticks = 0
+        fixed = ParameterDescriptor(read_only=True)
+        self._settings = {name: self.declare_parameter(name, value, fixed).value for name, value in PARAMETERS.items()}
+        self.episodes = self._read_episodes()
+        self.world = World(
+            1,
+            body=self._settings["body"],
+            max_boxes=self.episodes.max_boxes,
+            time_limit=self._settings["time_limit"] or None,
+        )
+        self._speed: float = self._settings["realtime"]
+        if not self._speed >= 0:
+            raise ValueError(f"realtime is {self._speed}: expected a speed above 0, or 0 for lockstep")
+        self._observation = ObservationPublisher(self, self.world, self._settings["top_camera_size"])
+        self._progress = self._read_progress()
+        self._stamp = self._first_stamp = self._progress.stamp
+        self._torque: NDArray[np.float32] | None = None
+        self._held_torque = np.zeros(self.world.body.action_size, np.float32)
+        self._instruction: conversions.InstructionReading | None = None
+        self._in_force = conversions.InstructionReading(0, 0)
+        self._recorded = False
+        self._paused = False
+        self._steps_due = 0
+        self._started: float | None = None
+        self._listen()
+        self._start_timer = self.create_timer(MATCH_PERIOD, self._start_when_complete)
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since the first tick."""
+        return 0.0 if self._started is None else time.perf_counter() - self._started
+
+    def _read_episodes(self) -> Episodes:
+        level_file = self._settings["level_file"]
+        return Episodes(
+            self._settings["episodes"] or None,
+            self._settings["seed"],
+            difficulty=self._settings["difficulty"],
+            level_file=Path(level_file) if level_file else None,
+        )
+
+    def _listen(self) -> None:
+        self.create_subscription(JointState, topics.TORQUE.name, self._on_torque, topics.TORQUE.qos)
+        # What a planner said before this simulator came must not arrive.
+        self.create_subscription(Instruction, topics.INSTRUCTION.name, self._on_instruction, live_qos())
+        if self._settings["await_recorder"]:
+            self.create_subscription(Header, topics.RECORDED.name, self._on_recorded, topics.RECORDED.qos)
+        self.create_service(Trigger, "/reset", self._on_reset)
+        self.create_service(SetBool, "/pause", self._on_pause)
+        self.create_service(Trigger, "/step", self._on_step)
+
+    # Starting
+
+    def _start_when_complete(self) -> None:
+        """Begin once somebody publishes torques and instructions, and a recorder is there if one is awaited."""
+        needed = [topics.TORQUE, topics.INSTRUCTION]
+        if self._settings["await_recorder"]:
+            needed.append(topics.RECORDED)
+        if not all(self.count_publishers(topic.name) for topic in needed):
+            return
+        self._start_timer.cancel()
+        self._started = time.perf_counter()
+        self._begin(self._progress.index)
+        if self._speed > 0:
+            self.create_timer(CONTROL_PERIOD / self._speed, self._on_clock)
+        else:
+            self.create_timer(self._settings["resend_after"] / 2, self._offer_again)
+
+    def _read_progress(self) -> Progress:
+        path = self._settings["progress_file"]
+        if not path or not Path(path).is_file():
+            return Progress()
+        progress = Progress(**json.loads(Path(path).read_text()))
+        # Stamps never repeat: skip the time that the interrupted episode can have used.
+        return progress._replace(stamp=progress.stamp + (self.world.time_limit + 1) * TICK)
+
+    def _write_progress(self) -> None:
+        path = self._settings["progress_file"]
+        if path:
+            partial = Path(path + ".partial")
+            partial.write_text(json.dumps(self._progress._asdict()))
+            partial.replace(path)
+
+    # Ticks
+
+    def _begin(self, index: int) -> None:
+        self._progress = Progress(index, self._progress.starts + 1, self._stamp)
+        self._write_progress()
+        self.world.reset([0], [self.episodes[index]])
+        self._held_torque[:] = 0.0
+        self._in_force = conversions.InstructionReading(0, 0)
+        self._offer()
+
+    def _offer(self) -> None:
+        """Publish the next tick."""
+        self._stamp += TICK
+        self._torque = self._instruction = None
+        self._recorded = not self._settings["await_recorder"]
+        self._publish()
+
+    def _publish(self) -> None:
+        self._offered = time.perf_counter()
+        label = TickLabel(self._stamp, self._progress.starts, self.episodes.difficulty, self._in_force.sequence)
+        self._observation.publish(label)
+
+    def _offer_again(self) -> None:
+        """Repeat a tick that stays without an answer: a node may have been started since."""
+        if not self._answered and time.perf_counter() - self._offered > self._settings["resend_after"]:
+            self.counts["repeated ticks"] += 1
+            self._publish()
+
+    @property
+    def _ended(self) -> bool:
+        return bool(self.world.done[0])
+
+    @property
+    def _answered(self) -> bool:
+        """Whether nothing is missing to go on; an episode's last tick needs no answer."""
+        return self._recorded and (self._ended or (self._torque is not None and self._instruction is not None))
+
+    def _proceed(self) -> None:
+        """In lockstep, go on as soon as the tick has been answered."""
+        while self._speed == 0 and self._answered and self._may_step() and not self.finished.done():
+            self._advance()
+
+    def _may_step(self) -> bool:
+        if not self._paused:
+            return True
+        if self._steps_due == 0:
+            return False
+        self._steps_due -= 1
+        return True
+
+    def _on_clock(self) -> None:
+        if self.finished.done() or not self._may_step():
+            return
+        if not self._ended and self._torque is None:
+            self.counts["late answers"] += 1
+        self._advance()
+
+    def _advance(self) -> None:
+        """Apply the tick's answers and offer the next tick, of this episode or of the next."""
+        if self._ended:
+            self._end()
+            return
+        if self._torque is not None:
+            self._held_torque = self._torque
+        if self._instruction is not None:
+            issued = self._instruction != self._in_force
+            self._in_force = self._instruction
+            self.world.instruct(np.array([self._in_force.direction]), np.array([issued]))
+        self.world.step(self._held_torque[None])
+        self.ticks += 1
+        self._offer()
+
+    def _end(self) -> None:
+        following = self._progress.index + 1
+        if following < len(self.episodes):
+            self._begin(following)
+        else:
+            self.finished.set_result(None)
+
+    # Answers
+
+    def _on_torque(self, message: JointState) -> None:
+        stamp = conversions.stamp_of(message)
+        if not self._is_known(stamp, topics.TORQUE.name):
+            return
+        try:
+            torque = conversions.torque_from_msg(message, self.world.body.action_size)
+        except ValueError as error:
+            self._reject("rejected torques", f"rejected a torque, zero is held instead: {error}")
+            torque = np.zeros_like(self._held_torque)
+        if stamp == self._stamp:
+            self._torque = torque
+            self._proceed()
+        elif self._speed > 0 and self._torque is None:
+            self._held_torque = torque
+
+    def _on_instruction(self, message: Instruction) -> None:
+        stamp = conversions.stamp_of(message)
+        if not self._is_known(stamp, topics.INSTRUCTION.name):
+            return
+        try:
+            instruction = conversions.instruction_from_msg(message)
+        except ValueError as error:
+            self._reject("rejected instructions", f"rejected an instruction: {error}")
+            return
+        if stamp == self._stamp or (self._speed > 0 and self._instruction is None):
+            self._instruction = instruction
+            self._proceed()
+
+    def _on_recorded(self, message: Header) -> None:
+        if conversions.stamp_of(message) == self._stamp:
+            self._recorded = True
+            self._proceed()
+
+    def _is_known(self, stamp: int, topic: str) -> bool:
+        """Tell whether a stamp is that of a tick of this run; repeated answers to earlier ticks are."""
+        if self._first_stamp < stamp <= self._stamp and stamp % TICK == 0:
+            return True
+        self._reject("messages of an unknown episode", f"{topic}: stamp {stamp} ns belongs to no episode of this run")
+        return False
+
+    def _reject(self, kind: str, reason: str) -> None:
+        self.counts[kind] += 1
+        self.get_logger().error(reason, throttle_duration_sec=LOG_PERIOD)
+
+    # Services
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self._started is not None and not self.finished.done()
+        if response.success:
+            self._begin(self._progress.index)
+            spec = self.episodes[self._progress.index]
+            response.message = f"episode {self._progress.starts} starts with seed {spec.seed}"
+        else:
+            response.message = "no episode is running"
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._paused, self._steps_due = request.data, 0
+        response.success, response.message = True, "paused" if request.data else "running"
+        self._proceed()
+        return response
+
+    def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self._paused
+        response.message = "one tick" if self._paused else "not paused: call /pause first"
+        if self._paused:
+            self._steps_due += 1
+            self._proceed()
+        return response
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(SimulatorNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
