@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_sim.bodies import INERTIAL_SIZE, get_body
-from mujoban_sim.camera import FRAME_SIZE
+from mujoban_sim.camera import FRAME_SIZE, CameraMount, project
 from mujoban_sim.grid import OFFSETS_XY, Instruction
 from mujoban_sim.interfaces import Controller, ControllerInput, Memory
 
@@ -44,6 +44,21 @@ class Gaussian(NamedTuple):
         """Return one draw, not limited to [-1, 1]."""
         noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
         return self.mean + self.scale * noise
+
+
+def gaussian_layers(features: int, actions: int) -> tuple[nn.Linear, nn.Linear]:
+    """Return the layers for mean and scale, which begin close to zero and to `INITIAL_SCALE`."""
+    layers = nn.Linear(features, actions), nn.Linear(features, actions)
+    for layer in layers:
+        nn.init.uniform_(layer.weight, -1e-3, 1e-3)
+        nn.init.zeros_(layer.bias)
+    return layers
+
+
+def gaussian(mean: Tensor, raw_scale: Tensor) -> Gaussian:
+    """Return the distribution given the outputs of `gaussian_layers`, [..., U] each."""
+    scale = INITIAL_SCALE * functional.softplus(raw_scale + math.log(math.expm1(1.0)))
+    return Gaussian(mean, scale + MIN_SCALE)
 
 
 class ControllerOutput(NamedTuple):
@@ -73,17 +88,27 @@ class ResidualBlock(nn.Module):
         return functional.relu(self.shortcut(x) + self.second(functional.relu(self.first(x))))
 
 
-def frame_encoder(channels: Sequence[int], features: int) -> nn.Sequential:
-    """Return the ResNet from frames [B, 3, 64, 64] to features [B, F]; the last block keeps its resolution."""
+def frame_encoder(channels: Sequence[int], features: int, rows: int) -> nn.Sequential:
+    """Return the ResNet from frames [B, 3, rows, 64] to features [B, F]; the last block keeps its resolution."""
     stem, *widths = channels
     layers: list[nn.Module] = [nn.Conv2d(3, stem, 4, 2, 1), nn.ReLU()]
-    size, width = FRAME_SIZE // 2, stem
+    shrink, width = 2, stem
     for i, outputs in enumerate(widths):
         stride = 1 if i == len(widths) - 1 else 2
         layers.append(ResidualBlock(width, outputs, stride))
-        size, width = size // stride, outputs
-    layers += [nn.Flatten(), nn.Linear(width * size * size, features), nn.LayerNorm(features), nn.ReLU()]
+        shrink, width = shrink * stride, outputs
+    flat = width * (rows // shrink) * (FRAME_SIZE // shrink)
+    layers += [nn.Flatten(), nn.Linear(flat, features), nn.LayerNorm(features), nn.ReLU()]
     return nn.Sequential(*layers)
+
+
+def rows_of_sky(mount: CameraMount, multiple: int) -> int:
+    """Return how many rows at the top of a frame can be left out: those above the horizon, rounded down.
+
+    Heading, which the skyline shows, is in proprioception; the rest of what matters is on the floor.
+    """
+    level = project([[1e6, 0.0, mount.height]], np.zeros(3), mount).pixels[0, 1]
+    return max(int(level) // multiple * multiple, 0)
 
 
 class VisuomotorController(nn.Module, Controller):
@@ -126,25 +151,20 @@ class VisuomotorController(nn.Module, Controller):
         self.proprio_size, self.action_size, self.hidden = layout.proprio_size, layout.action_size, hidden
         # Joint positions are replaced by two sine-cosine pairs; A is one-hot, beta one bit.
         inputs = self.proprio_size + 3 * self.joints + len(Instruction) + 1
-        self.encoder = frame_encoder(channels, features)
+        shrink = 2 ** (len(channels) - 1)
+        self.first_row = rows_of_sky(layout.camera, shrink)
+        self.encoder = frame_encoder(channels, features, FRAME_SIZE - self.first_row)
         self.body_encoder = nn.Sequential(nn.Linear(inputs, features), nn.LayerNorm(features), nn.ReLU())
         self.mix = nn.Sequential(nn.Linear(2 * features, features), nn.ReLU())
         self.lstm = nn.LSTMCell(features, hidden)
         self.trunk = nn.Sequential(nn.Linear(hidden + features, features), nn.ReLU())
-        self.mean = nn.Linear(features, self.action_size)
-        self.scale = nn.Linear(features, self.action_size)
+        self.mean, self.scale = gaussian_layers(features, self.action_size)
         self.register_buffer("proprio_mean", torch.zeros(self.proprio_size))
         self.register_buffer("proprio_scale", torch.ones(self.proprio_size))
         # Shape [5, 2]: the instructed direction in the map; stay counts as east.
         direction = np.where(OFFSETS_XY.any(1, keepdims=True), OFFSETS_XY, (1.0, 0.0))
         self.register_buffer("direction", torch.tensor(direction, dtype=torch.float32), persistent=False)
-        self._initialise()
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-
-    def _initialise(self) -> None:
-        for head in (self.mean, self.scale):
-            nn.init.uniform_(head.weight, -1e-3, 1e-3)
-            nn.init.zeros_(head.bias)
 
     def fit_normalisation(self, proprio: Tensor) -> None:
         """Take mean and deviation of proprioceptive samples, [M, P], for the normalisation of inputs."""
@@ -154,7 +174,7 @@ class VisuomotorController(nn.Module, Controller):
     def encode(self, frame: Tensor) -> Tensor:
         """Return the ResNet's features [M, F] of frames uint8 [M, 64, 64, 3]."""
         # A permuted NHWC tensor is channels_last already.
-        x = frame.permute(0, 3, 1, 2).to(self.mean.weight.dtype) / 255.0 - 0.5
+        x = frame[:, self.first_row :].permute(0, 3, 1, 2).to(self.mean.weight.dtype) / 255.0 - 0.5
         with torch.autocast(frame.device.type, torch.bfloat16, enabled=self.mixed_precision):
             features = self.encoder(x)
         return features.to(x.dtype)
@@ -218,8 +238,7 @@ class VisuomotorController(nn.Module, Controller):
     def distribution(self, features: Tensor) -> Gaussian:
         """Return the distribution over torques given `ControllerOutput.features`."""
         x = self.trunk(features)
-        unit = math.log(math.expm1(1.0))
-        return Gaussian(self.mean(x), INITIAL_SCALE * functional.softplus(self.scale(x) + unit) + MIN_SCALE)
+        return gaussian(self.mean(x), self.scale(x))
 
     def initial_memory(self, batch: int) -> Memory:
         """Return zeros: LSTM output and cell, [B, H] each."""

@@ -9,7 +9,6 @@ Shapes: B robots, T ticks, M sequences in a batch, U actuators, F features.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,16 +19,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_controller.controller import ControllerOutput, VisuomotorController
+from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask, TaskStep
 from mujoban_controller.replay import SequenceReplay
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.interfaces import Memory, renew_rows
-from mujoban_sim.oracles import DrivingGains, drive
-from mujoban_sim.world import World
-
-Teacher = Callable[[World], NDArray[np.float32]]
-"""Torques [B, U] in [-1, 1] from all that the world knows, its goals included."""
 
 _KINDS = len(GoalKind) - 1
 
@@ -38,20 +33,20 @@ _KINDS = len(GoalKind) - 1
 class DistilConfig:
     """Settings of distillation."""
 
-    length: int = 32
+    length: int = 16
     """T, ticks of a sequence."""
     sequences: int = 8
     """M, sequences of a batch."""
-    replay: int = 6400
+    replay: int = 10_000
     """Sequences in the replay."""
-    reuse: float = 2.0
+    reuse: float = 3.0
     """Times that each frame is trained on, on average."""
-    warm_up: int = 40_000
+    warm_up: int = 100_000
     """Frames over which the share of rows that the teacher drives falls from one to `teacher_share`."""
-    teacher_share: float = 0.05
+    teacher_share: float = 0.2
     noise: float = 0.1
     """Deviation of the noise on the torques of a third of the rows, which shows the student more states."""
-    learning_rate: float = 6e-4
+    learning_rate: float = 1e-3
     final_rate: float = 0.02
     """Share of the learning rate that is left at the end of the cosine schedule."""
     clip: float = 5.0
@@ -59,15 +54,6 @@ class DistilConfig:
     kind_weight: float = 0.05
     average: float = 0.998
     """Decay of the weights' moving average, which is what ships."""
-
-
-SCRIPTED_GAINS = DrivingGains(roll_feed_forward=0.5, roll_gain=1.0, least_speed=0.0)
-"""The scripted teacher makes up for damping, so it is faster than the oracle's defaults, and it stops at its goal."""
-
-
-def scripted_teacher(world: World) -> NDArray[np.float32]:
-    """Return the scripted driver's torques, [B, 2]."""
-    return drive(world.goals, world.truth(), SCRIPTED_GAINS)
 
 
 class GoalHead(nn.Module):
@@ -110,7 +96,7 @@ class Collector:
     """Lets the student act in the goal task and asks the teacher for labels."""
 
     def __init__(
-        self, task: GoalTask, student: VisuomotorController, teacher: Teacher, config: DistilConfig,
+        self, task: GoalTask, student: VisuomotorController, teacher: Driver, config: DistilConfig,
         rng: np.random.Generator,
     ) -> None:  # fmt: skip
         """Collect from `task` with randomness from `rng`."""
@@ -140,7 +126,7 @@ class Collector:
         task, first = self.task, self.task.first.copy()
         self._memory = renew_rows(self._memory, self.student.initial_memory(len(first)), first)
         inputs = task.observe()
-        label = self.teacher(task.world)
+        label = self.teacher(task)
         output = self.student(*self.student.to_tensors(inputs), memory=self._memory)
         self._memory = output.memory
         torque = output.action.mean[:, 0].numpy()
@@ -204,7 +190,7 @@ class Distiller:
     @torch.no_grad()
     def _follow(self) -> None:
         decay = min(self.config.average, (1 + self.updates) / (10 + self.updates))
-        ours, theirs = list(self.average.parameters()), list(self.student.parameters())
-        torch._foreach_lerp_(ours, theirs, 1.0 - decay)
+        for ours, theirs in zip(self.average.parameters(), self.student.parameters(), strict=True):
+            ours.lerp_(theirs, 1.0 - decay)
         self.average.proprio_mean.copy_(self.student.proprio_mean)
         self.average.proprio_scale.copy_(self.student.proprio_scale)

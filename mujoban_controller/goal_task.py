@@ -183,6 +183,13 @@ class GoalTask:
         """Share of the time limit that the instruction in force has had, [B]."""
         return self._noise.elapsed / INSTRUCTION_LIMIT
 
+    @property
+    def forward_speed(self) -> NDArray[np.float32]:
+        """Speed along the heading in cells per second, [B]."""
+        heading, velocity = self.world.pose[:, 2], self.world.velocity
+        along = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
+        return along / np.float32(self.world.body.cell_size)
+
     def observe(self, *, camera: bool = True) -> ControllerInput:
         """Return what controllers see in this tick, ground truth included; without `camera` frames are empty."""
         world, b = self.world, self.world.batch
@@ -203,7 +210,7 @@ class GoalTask:
         failed = ended & ~completed & (self._noise.elapsed >= config.terminations.limit)
         reward = config.completed_reward * (ended & completed) + config.failed_reward * failed
         reward -= config.drift_penalty * np.maximum(drift(world) - before, 0.0)
-        reward -= config.backwards_penalty * (self._forward_speed() < -0.05 * world.body.cell_size)
+        reward -= config.backwards_penalty * (self.forward_speed < -0.05)
         rows = np.flatnonzero(ended)
         # An instruction that the end of its episode cut short says nothing.
         judged = np.flatnonzero(ended & (completed | failed))
@@ -227,10 +234,6 @@ class GoalTask:
         return EpisodeEnd(
             row, seed, bool(world.solved[row]), float(world.episode_return[row]), int(world.steps[row])
         )
-
-    def _forward_speed(self) -> NDArray[np.float32]:
-        heading = self.world.pose[:, 2]
-        return self.world.velocity[:, 0] * np.cos(heading) + self.world.velocity[:, 1] * np.sin(heading)
 
     def _distance(self) -> NDArray[np.float64]:
         """Return the distance, beyond the tolerance, of what has to reach its target, in cells, [B]."""

@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from mujoban_controller.drivers import ControllerDriver, Driver
 from mujoban_controller.goal_task import EpisodeEnd, GoalTask, Outcome, judging_config
 from mujoban_rl.stats import wilson_interval
 from mujoban_sim.generator import generate_level
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.grid import Instruction
-from mujoban_sim.interfaces import Controller, Planner, renew_rows
+from mujoban_sim.interfaces import Controller, Planner
 from mujoban_sim.world import EpisodeSpec
 
 
@@ -88,7 +89,7 @@ class SeededEpisodes:
 
 
 def judge(
-    controller: Controller,
+    driver: Driver | Controller,
     planner: Planner,
     *,
     episodes: int,
@@ -101,7 +102,7 @@ def judge(
     """Play whole episodes with a planner's instructions and exact termination signals.
 
     Args:
-        controller: Learned or privileged.
+        driver: A controller, learned or privileged, or anything else that drives.
         planner: Gives the instructions from true abstract states.
         episodes: Levels to play, with seeds `first_seed`, `first_seed` + 1, ...
         first_seed: Seed of the first level.
@@ -120,13 +121,11 @@ def judge(
         np.random.default_rng(first_seed), threads=threads,
     )  # fmt: skip
     last_seed = first_seed + episodes
-    state = controller.initial_memory(batch)
+    drive = ControllerDriver(driver) if isinstance(driver, Controller) else driver
     summary, ended, lost, last_failure = OutcomeSummary(), list[EpisodeEnd](), dict[str, str](), dict[int, str]()
     seeds = np.array([spec.seed for spec in task.world.episodes if spec is not None])
     while len(ended) < episodes:
-        state = renew_rows(state, controller.initial_memory(batch), task.first)
-        torque, state = controller.step(task.observe(camera=not controller.privileged), state)
-        result = task.step(torque)
+        result = task.step(drive(task))
         counted = [o for o in result.outcomes if seeds[o.row] < last_seed]
         summary.add(counted)
         last_failure |= {o.row: failure_name(o) for o in counted if not o.completed}

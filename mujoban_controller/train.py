@@ -1,28 +1,32 @@
-"""Train the controller: `python -m mujoban_controller.train --stage teacher|distil|mpo`.
+"""Train the controller: `python -m mujoban_controller.train --stage teacher|distil|mpo --run DIR`.
 
 The recorded route is `distil`: a privileged teacher is distilled into the camera policy. `teacher` trains a
 privileged policy by MPO, and `mpo` trains the camera policy by MPO with an asymmetric critic (paper C.3), from
-scratch or from distilled weights. Every run is resumed by giving its directory again.
+scratch or from distilled weights (`--initial`). Give the directory again to resume a run; its replay fills anew.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 import tyro
+from torch import nn
 
 from mujoban_controller.controller import VisuomotorController
-from mujoban_controller.distil import Collector, DistilConfig, Distiller, scripted_teacher
+from mujoban_controller.distil import DistilConfig
+from mujoban_controller.drivers import Driver, PrivilegedDriver, scripted_driver
 from mujoban_controller.goal_task import EpisodeSource, GoalTask, GoalTaskConfig
 from mujoban_controller.judge import OutcomeSummary, judge
-from mujoban_controller.replay import SequenceReplay
+from mujoban_controller.learners import DistilLearner, Learner, ReinforcementLearner
+from mujoban_controller.mpo import MPOTrainingConfig
+from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
-from mujoban_rl.weights import load_weights, provenance, save_weights
+from mujoban_rl.weights import digest, load_weights, provenance, save_weights
 from mujoban_sim.generator import TRAIN_SEEDS, generate_level
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sim.world import EpisodeSpec
@@ -44,15 +48,23 @@ class NetworkConfig:
 class TrainConfig:
     """What must not change between the bits of a run."""
 
-    stage: Literal["distil"] = "distil"
+    stage: Literal["teacher", "distil", "mpo"] = "distil"
     steps: int = 1_500_000
     """Environment steps (frames)."""
     seed: int = 0
-    initial: str | None = None
+    initial: Path | None = None
     """Weights to start from."""
+    teacher: Path | None = None
+    """Weights of a privileged teacher to distil; without it the scripted driver teaches."""
     task: GoalTaskConfig = field(default_factory=GoalTaskConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     distil: DistilConfig = field(default_factory=DistilConfig)
+    mpo: MPOTrainingConfig = field(default_factory=MPOTrainingConfig)
+
+    def __post_init__(self) -> None:
+        """Reject settings that contradict each other."""
+        if self.teacher is not None and self.stage != "distil":
+            raise ValueError(f"--teacher {self.teacher}: only the stage distil has a teacher, not {self.stage}")
 
 
 @dataclass(frozen=True)
@@ -61,7 +73,7 @@ class Options:
 
     run: Path
     """Run directory; an existing one is resumed."""
-    config: tyro.conf.OmitArgPrefixes[TrainConfig] = field(default_factory=TrainConfig)
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     seconds: float | None = None
     """Stop after so many seconds; resume later."""
     evaluate_every: int = 300_000
@@ -70,6 +82,7 @@ class Options:
     save_every: float = 300.0
     """Seconds between checkpoints."""
     device: str = "cpu"
+    """Where networks learn; the policy acts there too."""
     threads: int = 1
 
 
@@ -85,135 +98,127 @@ def training_episodes(difficulty: int, rng: np.random.Generator) -> EpisodeSourc
     return draw
 
 
-class DistilRun:
-    """A distillation that can stop and go on."""
+def make_learner(config: TrainConfig, *, threads: int = 1, device: str = "cpu", stream: int = 0) -> Learner[Any]:
+    """Return the learner of a stage, its task started.
+
+    Args:
+        config: The run's settings.
+        threads: Threads for physics.
+        device: Device of the networks.
+        stream: Random stream of the task, another one after every resumption, so that no episode comes twice.
+    """
+    torch.manual_seed(config.seed)
+    rng = np.random.default_rng([config.seed, stream])
+    episodes = training_episodes(config.task.difficulty, rng)
+    task = GoalTask(config.task, OraclePlanner(max_nodes=PLANNER_NODES), episodes, rng, threads=threads)
+    fresh, body = config.initial is None, config.task.body
+    if config.stage == "teacher":
+        weights = config.initial
+        policy = PrivilegedPolicy(body) if weights is None else load_weights(PrivilegedPolicy, weights)
+        return ReinforcementLearner(policy.train().to(device), task, config.mpo, rng, fresh=fresh)
+    student = _camera_policy(config).train().to(device)
+    student.mixed_precision = True
+    if config.stage == "mpo":
+        return ReinforcementLearner(student, task, config.mpo, rng, fresh=fresh)
+    teacher = _teacher(config.teacher)
+    return DistilLearner(student, task, teacher, config.distil, rng, steps=config.steps, fresh=fresh)
+
+
+def _camera_policy(config: TrainConfig) -> VisuomotorController:
+    if config.initial is not None:
+        return load_weights(VisuomotorController, config.initial)
+    n = config.network
+    return VisuomotorController(config.task.body, n.channels, n.features, n.hidden)
+
+
+def _teacher(weights: Path | None) -> Driver:
+    return scripted_driver if weights is None else PrivilegedDriver(load_weights(PrivilegedPolicy, weights))
+
+
+class TrainingRun:
+    """A run that can stop and go on."""
 
     def __init__(self, options: Options) -> None:
         """Set everything up and restore the newest checkpoint of the run directory, if there is one."""
         self.options, self.config = options, options.config
-        config = self.config
-        torch.manual_seed(config.seed)
-        self.rng = np.random.default_rng(config.seed)
-        self.directory = RunDirectory(options.run, config)
-        self.student = self._student()
-        self.student.mixed_precision = True
-        frames = config.distil.length * config.distil.sequences
-        self.distiller = Distiller(self.student, config.distil, round(config.steps * config.distil.reuse / frames))
-        self.replay = SequenceReplay(config.distil.replay, config.distil.length)
-        self.frames = 0
-        self._debt = 0.0
-        self._restore()
-        # Another stream after every resumption, so that no episode is seen twice.
-        task_rng = np.random.default_rng([config.seed, self.frames, 1])
-        planner = OraclePlanner(max_nodes=PLANNER_NODES)
-        task = GoalTask(
-            config.task, planner, training_episodes(config.task.difficulty, task_rng), task_rng,
-            threads=options.threads,
-        )  # fmt: skip
-        self.collector = Collector(task, self.student, scripted_teacher, config.distil, task_rng)
-        self.collector.frames = self.frames
-
-    def _student(self) -> VisuomotorController:
-        if self.config.initial is not None:
-            return load_weights(VisuomotorController, self.config.initial).train()
-        return VisuomotorController(body=self.config.task.body, **asdict(self.config.network))
-
-    def _restore(self) -> None:
-        snapshot = self.directory.load(modules=self._modules(), optimisers={"adam": self.distiller.optimiser})
+        self.directory = RunDirectory(options.run, self.config)
+        done = self._steps_done()
+        self.learner = make_learner(self.config, threads=options.threads, device=options.device, stream=done)
+        learner = self.learner
+        snapshot = self.directory.load(modules=learner.modules, optimisers=learner.optimisers)
         if snapshot is not None:
-            self.frames = snapshot.step
-            self.distiller.updates = snapshot.extra["updates"]
-            self.rng.bit_generator.state = snapshot.extra["rng"]
+            learner.frames, learner.updates = snapshot.step, snapshot.extra["updates"]
 
-    def _modules(self) -> dict[str, torch.nn.Module]:
-        d = self.distiller
-        return {"student": d.student, "average": d.average, "head": d.head}
-
-    def save(self) -> None:
-        """Write a checkpoint."""
-        extra = {"updates": self.distiller.updates, "rng": self.rng.bit_generator.state}
-        self.directory.save(
-            self.frames, modules=self._modules(), optimisers={"adam": self.distiller.optimiser}, extra=extra
-        )
-
-    def export(self, metrics: dict[str, Any]) -> None:
-        """Write the averaged weights with their record into the run directory."""
-        d = self.distiller
-        record = {
-            **provenance(),
-            "training": asdict(self.config),
-            "data": f"generated levels of difficulty {self.config.task.difficulty}, seeds of TRAIN_SEEDS",
-            "steps": self.frames,
-            "updates": d.updates,
-            "metrics": metrics,
-        }
-        save_weights(self.directory.path / "controller.safetensors", d.average, d.average.config, record)
+    def _steps_done(self) -> int:
+        snapshot = self.directory.load(modules={})
+        return 0 if snapshot is None else snapshot.step
 
     def run(self) -> None:
-        """Train until the steps or seconds are over or a signal comes."""
-        options, config = self.options, self.config
-        with TrainingLog(self.directory, total=config.steps, initial=self.frames, unit="frame") as log:
-            with StopSignal() as stop, np.errstate(all="raise", under="ignore"):
-                self._loop(log, stop, TimeLimit(options.seconds))
-            self.save()
-            self.export(self._evaluate(log))
+        """Train until the steps or seconds are over or a signal comes; then evaluate and export."""
+        learner, steps = self.learner, self.config.steps
+        with TrainingLog(self.directory, total=steps, initial=learner.frames, unit="frame") as log:
+            with StopSignal() as stop:
+                self._loop(log, stop, TimeLimit(self.options.seconds))
+            self._save()
+            self._export(self._evaluate(log) if learner.frames >= steps else {})
 
     def _loop(self, log: TrainingLog, stop: StopSignal, limit: TimeLimit) -> None:
-        guard, saved, evaluated = NaNGuard(), 0.0, self.frames
-        while self.frames < self.config.steps and not stop.requested and not limit.reached:
-            before = self.frames
-            summary = self._collect()
-            stats = self._learn(guard)
-            log.advance(self.frames - before)
-            if stats:
-                log.scalars(self.frames, {**stats, **flatten(summary)})
-            if limit.elapsed - saved > self.options.save_every:
+        learner, options = self.learner, self.options
+        guard, saved, evaluated = NaNGuard(), 0.0, learner.frames
+        while learner.frames < self.config.steps and not stop.requested and not limit.reached:
+            before, summary = learner.frames, OutcomeSummary()
+            for step in learner.collect():
+                summary.add(step.outcomes)
+            stats = learner.learn()
+            guard.accept(*stats.values())
+            log.advance(learner.frames - before)
+            log.scalars(learner.frames, {**stats, **flatten(summary)})
+            if limit.elapsed - saved > options.save_every:
                 saved = limit.elapsed
-                self.save()
-            if self.frames - evaluated >= self.options.evaluate_every:
-                evaluated = self.frames
-                self.export(self._evaluate(log))
+                self._save()
+            if learner.frames - evaluated >= options.evaluate_every:
+                evaluated = learner.frames
+                self._export(self._evaluate(log))
 
-    def _collect(self) -> OutcomeSummary:
-        summary = OutcomeSummary()
-        ticks, starts, steps = self.collector.collect()
-        if not self.frames and self.config.initial is None:
-            self.student.fit_normalisation(torch.from_numpy(ticks["proprio"]).flatten(0, 1))
-        for step in steps:
-            summary.add(step.outcomes)
-        self.replay.add(ticks, starts)
-        count = ticks["first"].size
-        self.frames += count
-        self._debt += count * self.config.distil.reuse
-        return summary
+    def _save(self) -> None:
+        learner = self.learner
+        self.directory.save(
+            learner.frames, modules=learner.modules, optimisers=learner.optimisers,
+            extra={"updates": learner.updates},
+        )  # fmt: skip
 
-    def _learn(self, guard: NaNGuard) -> dict[str, Any]:
-        config = self.config.distil
-        per_update = config.length * config.sequences
-        total: dict[str, float] = {}
-        updates = int(self._debt // per_update)
-        for _ in range(updates):
-            stats = self.distiller.update(self.replay, self.rng)
-            guard.accept(stats["loss/action"], stats["gradient_norm"])
-            for name, value in stats.items():
-                total[name] = total.get(name, 0.0) + float(value) / updates
-        self._debt -= updates * per_update
-        return total
+    def _export(self, metrics: dict[str, Any]) -> None:
+        config, learner = self.config, self.learner
+        record = {
+            **provenance(),
+            "training": self.directory.config,
+            "teacher": "scripted driver" if config.teacher is None else digest(config.teacher),
+            "initial": None if config.initial is None else digest(config.initial),
+            "data": f"generated levels of difficulty {config.task.difficulty}, seeds of TRAIN_SEEDS",
+            "steps": learner.frames,
+            "updates": learner.updates,
+            "metrics": metrics,
+        }
+        name = "teacher" if config.stage == "teacher" else "controller"
+        path = self.directory.path / f"{name}.safetensors"
+        save_weights(path, learner.product, learner.product.config, record)
 
     def _evaluate(self, log: TrainingLog) -> dict[str, Any]:
-        options = self.options
+        options, learner = self.options, self.learner
         if not options.evaluation_episodes:
             return {}
-        student = self.distiller.average.eval()
+        product: nn.Module = learner.product
+        product.eval()
         report = judge(
-            student, OraclePlanner(), episodes=options.evaluation_episodes, body=self.config.task.body,
-            difficulty=self.config.task.difficulty, batch=min(64, options.evaluation_episodes), threads=options.threads,
+            learner.driver, OraclePlanner(), episodes=options.evaluation_episodes, body=self.config.task.body,
+            difficulty=self.config.task.difficulty, threads=options.threads,
         )  # fmt: skip
+        product.train()
         kinds = report["instructions"]["kinds"]
         values = {"evaluation/solved": report["success_rate"]}
         values |= {f"evaluation/{kind}": kinds[kind]["success_rate"] for kind in kinds}
-        log.scalars(self.frames, values)
-        log.message(f"{self.frames} frames: {report['success_rate']:.3f} of levels solved, {report['lost']}")
+        log.scalars(learner.frames, values)
+        log.message(f"{learner.frames} frames: {report['success_rate']:.3f} of levels solved; lost {report['lost']}")
         return report
 
 
@@ -230,15 +235,15 @@ def flatten(summary: OutcomeSummary) -> dict[str, float]:
 
 def main() -> int:
     """Run the command."""
-    options = tyro.cli(Options)
-    torch.set_num_threads(options.threads)
-    DistilRun(options).run()
+    try:
+        options = tyro.cli(Options)
+        torch.set_num_threads(options.threads)
+        TrainingRun(options).run()
+    except (ValueError, OSError) as error:
+        print(f"mujoban_controller.train: error: {error}", file=sys.stderr)
+        return 2
     return 0
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except ValueError as error:
-        print(f"mujoban_controller.train: error: {error}", file=sys.stderr)
-        sys.exit(2)
+    sys.exit(main())

@@ -1,0 +1,91 @@
+"""Judge the controller: `python -m mujoban_controller.evaluate --episodes 512 --seed 1000`.
+
+Whole episodes of a solver's plans with exact termination signals; prints JSON. `--driver` compares the camera policy with
+the scripted driver or a privileged teacher under the same judgement, which shows the loss from distillation.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+
+from mujoban_controller import SHIPPED
+from mujoban_controller.controller import VisuomotorController
+from mujoban_controller.drivers import Driver, PrivilegedDriver, scripted_driver
+from mujoban_controller.judge import judge
+from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_rl.weights import digest, load_weights, write_atomically
+from mujoban_sim.generator import TEST_SEEDS
+from mujoban_sim.interfaces import Controller
+from mujoban_sim.oracles import OraclePlanner
+
+
+@dataclass(frozen=True)
+class Options:
+    """Judge the controller on solver plans."""
+
+    driver: Literal["camera", "teacher", "scripted"] = "camera"
+    """Camera policy, privileged policy or scripted driver."""
+    weights: Path | None = None
+    """Weights of camera policy or teacher; those that ship by default."""
+    episodes: int = 128
+    seed: int = 0
+    """Seed of the first level; level i has seed + i."""
+    difficulty: int = 5
+    body: str = "ball"
+    batch: int = 64
+    threads: int = 1
+    device: str = "cpu"
+    json: Path | None = None
+    """File for the report instead of standard output."""
+
+    def __post_init__(self) -> None:
+        """Reject what cannot be judged."""
+        if self.episodes < 1:
+            raise ValueError(f"--episodes {self.episodes}: expected at least 1")
+        if self.seed not in TEST_SEEDS or self.seed + self.episodes > TEST_SEEDS.stop:
+            raise ValueError(f"--seed {self.seed}: expected test seeds, {TEST_SEEDS.start} to {TEST_SEEDS.stop - 1}")
+        if self.driver == "teacher" and self.weights is None:
+            raise ValueError("--driver teacher: expected --weights of a privileged policy")
+
+
+def make_driver(options: Options) -> tuple[Driver | Controller, str]:
+    """Return the driver and what identifies it: the digest of its weights, or its name."""
+    if options.driver == "scripted":
+        return scripted_driver, "scripted"
+    if options.driver == "teacher" and options.weights is not None:
+        policy = load_weights(PrivilegedPolicy, options.weights, options.device)
+        return PrivilegedDriver(policy), digest(options.weights)
+    weights = options.weights or SHIPPED
+    return load_weights(VisuomotorController, weights, options.device), digest(weights)
+
+
+def main() -> int:
+    """Run the command."""
+    try:
+        options = tyro.cli(Options)
+        torch.set_num_threads(options.threads)
+        driver, identity = make_driver(options)
+        report = judge(
+            driver, OraclePlanner(), episodes=options.episodes, first_seed=options.seed,
+            difficulty=options.difficulty, body=options.body, batch=options.batch, threads=options.threads,
+        )  # fmt: skip
+    except (ValueError, OSError) as error:
+        print(f"mujoban_controller.evaluate: error: {error}", file=sys.stderr)
+        return 2
+    text = json.dumps({**report, "weights": identity, "episodes": options.episodes, "seed": options.seed}, indent=2)
+    if options.json is None:
+        print(text)
+    else:
+        write_atomically(options.json, (text + "\n").encode())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
