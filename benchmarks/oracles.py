@@ -15,10 +15,10 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from bringup.rollout import ticks
 from mujoban_rl.stats import wilson_interval
 from mujoban_sim.episodes import Episodes
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.interfaces import Observation
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.sense_plan_act import SensePlanAct
 from mujoban_sim.world import World
@@ -31,51 +31,52 @@ class Options:
     levels: int = 512
     difficulty: int = 5
     seed: int = 1000
+    batch: int = 64
     threads: int = 2
 
 
 def run(options: Options | None = None) -> dict[str, Any]:
-    """Play the levels in one batch until all are solved or truncated; see the module for what is returned."""
+    """Play every level once; see the module for what is returned."""
     options = options or Options()
-    count = options.levels
-    episodes = list(Episodes(count, options.seed, difficulty=options.difficulty))
-    world = World(count, threads=options.threads)
-    world.reset(np.arange(count), episodes)
+    episodes = list(Episodes(options.levels, options.seed, difficulty=options.difficulty))
+    batch = min(options.batch, len(episodes))
+    world = World(batch, threads=options.threads)
     policy = SensePlanAct(OracleEstimator(), OracleTermination(), OraclePlanner(), OracleController())
-    state = policy.initial_state(np.array([e.seed for e in episodes]))
-    # The oracles look at no frame.
-    frame = np.zeros((count, 1, 1, 3), np.uint8)
-    issued, timed_out, started = np.zeros((3, count), np.int64)
+    issued, timed_out, solved = 0, 0, []
+    returns, lengths, unsolved = [], [], []
     durations: dict[GoalKind, list[int]] = {kind: [] for kind in GoalKind}
+    begun, kind = np.zeros((2, batch), np.int64)
     start = time.perf_counter()
-    for tick in tqdm(range(world.time_limit), disable=None):
-        decision, state = policy.step(Observation(frame, world.proprio, world.pose), world.truth(), state)
-        live = ~world.done
-        completed = decision.termination.terminated & ~decision.termination.timed_out & live
-        for row in np.flatnonzero(completed):
-            durations[GoalKind(world.goals.kind[row])].append(tick - int(started[row]))
-        timed_out += decision.termination.timed_out & live
-        issued += decision.issued & live
-        started[decision.issued] = tick
-        world.instruct(decision.instruction, decision.issued)
-        world.step(decision.torque)
-        if world.done.all():
-            break
-    solved = int(world.solved.sum())
+    with tqdm(total=len(episodes), disable=None) as progress:
+        for tick in ticks(policy, world, episodes):
+            rows, termination = tick.rows, tick.decision.termination
+            issued += int(tick.decision.issued.sum())
+            timed_out += int(termination.timed_out.sum())
+            for m in np.flatnonzero(termination.terminated & ~termination.timed_out):
+                durations[GoalKind(kind[rows[m]])].append(int(tick.step[m] - begun[rows[m]]))
+            new = tick.decision.issued
+            begun[rows[new]], kind[rows[new]] = tick.step[new], world.goals.kind[rows[new]]
+            for m in np.flatnonzero(tick.solved | tick.truncated):
+                solved.append(bool(tick.solved[m]))
+                returns.append(float(tick.episode_return[m]))
+                lengths.append(int(tick.step[m]) + 1)
+                if not tick.solved[m]:
+                    unsolved.append(episodes[tick.episode[m]].seed)
+                progress.update()
     return {
-        "episodes": count,
-        "success_rate": solved / count,
-        "success_interval": wilson_interval(solved, count),
-        "mean_return": float(world.episode_return.mean()),
-        "median_steps": float(np.median(world.steps)),
-        "instructions": int(issued.sum()),
-        "timed_out": int(timed_out.sum()),
+        "episodes": len(solved),
+        "success_rate": float(np.mean(solved)),
+        "success_interval": wilson_interval(sum(solved), len(solved)),
+        "mean_return": float(np.mean(returns)),
+        "median_steps": float(np.median(lengths)),
+        "instructions": issued,
+        "timed_out": timed_out,
         "steps_per_instruction": {
-            kind.name.lower(): dict(zip(("median", "p95"), np.percentile(steps, [50, 95]).tolist(), strict=True))
+            kind.name.lower(): {"median": float(np.median(steps)), "p95": float(np.percentile(steps, 95))}
             for kind, steps in durations.items()
             if steps
         },
-        "unsolved_seeds": [e.seed for e, done in zip(episodes, world.solved, strict=True) if not done],
+        "unsolved_seeds": unsolved,
         "seconds": time.perf_counter() - start,
     }
 

@@ -55,8 +55,7 @@ class World:
     """B independent Mujoban worlds that step together at 20 Hz.
 
     A row is an episode: `reset` starts it, `instruct` tells which instruction it follows, `step` applies
-    torques. A row whose episode has ended (solved or truncated) keeps moving, but its reward is zero and its
-    counters stand still until it is reset. The same level, seed and torques give the same values exactly, in
+    torques. A row whose episode has ended (solved or truncated) stands still, without reward, until it is reset. The same level, seed and torques give the same values exactly, in
     every process and whatever ran in the row before.
 
     The arrays are live: they change in place. Copy what you keep (`observation` and `truth` return copies).
@@ -121,7 +120,7 @@ class World:
             raise ValueError(f"time_limit is {time_limit}: expected at least 1 step")
         self.goals = GoalTracker(batch, cell_size=self.body.cell_size, tolerance=tolerance, max_box_speed=max_box_speed)
         self._threads = threads
-        self._all_rows = np.arange(batch)
+        self._all_rows = self._live = np.arange(batch)
         self._renderers: dict[int, FrameRenderer] = {}
         self._episodes: list[EpisodeSpec | None] = [None] * batch
         self._undrawn: dict[int, set[int]] = {}
@@ -231,6 +230,7 @@ class World:
         self._physics.set_models(self._models)
         for counter in (self.reward, self.episode_return, self.steps, self.solved, self.truncated):
             counter[chosen] = 0
+        self._live = np.flatnonzero(~self.done)
         self.goals.reset(chosen)
         pose = np.zeros((len(chosen), 3))
         boxes = np.zeros((len(chosen), self.max_boxes, 2))
@@ -307,12 +307,19 @@ class World:
             raise RuntimeError("rows without an episode: call reset on all rows before step")
         if not apply_torque(action, self._ctrl):
             raise TorqueError(_torque_message(action))
-        self._physics.step(nstep=SUBSTEPS, stage=_STAGE_VELOCITY)
-        self._update(self._all_rows, advance=True)
+        live = self._live
+        if len(live) == self.batch:
+            self._physics.step(nstep=SUBSTEPS, stage=_STAGE_VELOCITY)
+        else:
+            self.reward[:] = 0.0
+            self._physics.step(ids=live, nstep=SUBSTEPS, stage=_STAGE_VELOCITY)
+        if self._update(live, advance=True):
+            self._live = np.flatnonzero(~self.done)
 
-    def _update(self, rows: NDArray[np.int64], advance: bool) -> None:
+    def _update(self, rows: NDArray[np.int64], advance: bool) -> bool:
+        """Derive everything from physics; return whether an episode has ended in one of the rows."""
         goals, body = self.goals, self.body
-        update(
+        return update(
             rows, advance, self._qpos, self._qvel, self._sensors, self._root, body.root == "free",
             self._joint_qpos, self._joint_qvel, body.cell_size, self.time_limit, self.box_count, self.target,
             goals.kind, goals.robot_target, goals.box_index, goals.box_target, goals.tolerance, goals.max_box_speed,

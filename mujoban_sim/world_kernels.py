@@ -149,14 +149,15 @@ def update(
     steps: NDArray[np.int64],
     solved: NDArray[np.bool_],
     truncated: NDArray[np.bool_],
-) -> None:
-    """Derive everything that `World` shows of the given rows, [M], from the state of physics.
+) -> bool:
+    """Derive everything that `World` shows of the given rows, [M], from physics; return whether an episode ended.
 
     `advance` says whether to count a step and give rewards, as after physics has advanced. The robot's positions
     start at `root` in `qpos` [B, nq], its velocities at the same offset in `qvel` [B, nv]; `joint_qpos` and
     `joint_qvel`, [J], are the offsets of the proprioceptive joints. `sensors` is [B, 9]. All that follows
     `time_limit` is as in `World` and its `GoalTracker`; from `completed` on it is written.
     """
+    ended = False
     for b in rows:
         _observe_robot(
             qpos[b, root:], qvel[b, root:], sensors[b], free_root, joint_qpos, joint_qvel,
@@ -175,14 +176,13 @@ def update(
         completed[b] = is_completed(int(kind[b]), robot_offset, box_offset, speed, tolerance, max_box_speed)
         if not advance:
             continue
-        reward[b] = 0.0
-        if solved[b] or truncated[b]:
-            continue
         steps[b] += 1
         solved[b] = boxes_on_target[b] == box_count[b]
         truncated[b] = steps[b] >= time_limit and not solved[b]
         reward[b] = (boxes_on_target[b] - before) * BOX_REWARD + (SOLVED_REWARD if solved[b] else 0.0)
         episode_return[b] += reward[b]
+        ended |= bool(solved[b] or truncated[b])
+    return ended
 
 
 @njit(cache=True, nogil=True)
