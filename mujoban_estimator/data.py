@@ -68,18 +68,23 @@ class Batcher:
         self._seen = np.zeros((len(streams), GRID_SIZE, GRID_SIZE), np.bool_)
 
     def __iter__(self) -> Iterator[Batch]:
-        """Yield batches until a stream ends."""
+        """Return itself: batches come until every stream has ended."""
         return self
 
     def __next__(self) -> Batch:
-        """Return the next stretch of every stream."""
-        stretches = [next(stream) for stream in self._streams]
+        """Return the next stretch of every stream; streams that have ended are padding."""
+        stretches = [next(stream, None) for stream in self._streams]
+        some = next((s for s in stretches if s is not None), None)
+        if some is None:
+            raise StopIteration
+        present = [some if s is None else s for s in stretches]
         padded = [
-            np.stack([_pad(s[i], self._length) for s in stretches])  # pyright: ignore[reportArgumentType]
+            np.stack([_pad(s[i], self._length) for s in present])  # pyright: ignore[reportArgumentType]
             for i in range(len(Stretch._fields) - 1)
         ]
-        first = np.array([s.first for s in stretches])
-        valid = np.arange(self._length) < np.array([len(s.frame) for s in stretches])[:, None]
+        first = np.array([s is not None and s.first for s in stretches])
+        count = np.array([0 if s is None else len(s.frame) for s in stretches])
+        valid = np.arange(self._length) < count[:, None]
         in_view = self._look(padded[6], padded[1])
         self._seen[first] = False
         seen = np.logical_or.accumulate(in_view, axis=1) | self._seen[:, None]

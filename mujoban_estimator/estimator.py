@@ -22,6 +22,8 @@ from mujoban_sim.interfaces import Estimator, EstimatorInput, Memory
 
 BINARY: Final = (WALL, TARGET, BOX)
 """Layers with an independent classifier per cell; the agent's is one softmax over all cells."""
+_GROUPS: Final = 4
+"""Groups in which frames attend."""
 _PRIOR_LOGITS: Final = {WALL: 0.0, TARGET: -3.0, AGENT: 0.0, BOX: -3.0}
 
 
@@ -30,7 +32,7 @@ class EstimatorConfig:
     """Size of the network, body that carries the camera, and how often the belief is updated."""
 
     body: str = "ball"
-    stem: int = 24
+    stem: int = 16
     channels: int = 32
     blocks: int = 2
     embedding: int = 64
@@ -99,19 +101,19 @@ class GeometricAttention(nn.Module):
         """
         n, channels = features.shape[:2]
         logits = self._logits(relative, pixels).flatten(1, 2)  # [N, M * A, 2, 16]
-        # Most anchors are out of the frame: attend with the first S of each frame, S the most that any frame has.
-        shown = visible.flatten(1)
-        most = max(int(shown.sum(dim=1).max()), 1)
-        order = torch.argsort(shown, dim=1, descending=True, stable=True)[:, :most]
-        frame = torch.arange(n, device=order.device)[:, None]
-        across, down = logits[frame, order].unbind(dim=-2)
-        # Shape [N, S, H * W]
-        attention = torch.softmax((down[..., :, None] + across[..., None, :]).flatten(-2), dim=-1).to(features.dtype)
         # Shape [N, H * W, C]
         values = features.permute(0, 2, 3, 1).reshape(n, -1, channels)
-        looked = torch.bmm(attention, values) * shown[frame, order][..., None].to(features.dtype)
-        everywhere = looked.new_zeros(n, shown.shape[1], channels).index_put((frame, order), looked)
-        return everywhere.reshape(n, CELLS, -1)
+        shown = visible.flatten(1)
+        counts = shown.sum(dim=1)
+        # Most anchors are out of the frame. Frames are grouped by how many they show, which saves most of the work.
+        order = torch.argsort(shown, dim=1, descending=True, stable=True)
+        looked = values.new_zeros(n, shown.shape[1], channels)
+        for frames in torch.argsort(counts).split(-(-n // _GROUPS)):
+            row = frames[:, None]
+            column = order[frames, : max(int(counts[frames[-1]]), 1)]
+            part = _attend(logits[row, column], values[frames]) * shown[row, column][..., None].to(values.dtype)
+            looked = looked.index_put((row, column), part)
+        return looked.reshape(n, CELLS, -1)
 
     def _logits(self, relative: Tensor, pixels: Tensor) -> Tensor:
         """Return attention logits per row and column of the feature map, [N, M, A, 2, 16]."""
@@ -120,13 +122,21 @@ class GeometricAttention(nn.Module):
         return prior + self.learned(relative).float().reshape(prior.shape)
 
 
+def _attend(logits: Tensor, values: Tensor) -> Tensor:
+    """Return attended features [N, S, C]: logits per column and row [N, S, 2, 16], values [N, H * W, C]."""
+    across, down = logits.unbind(dim=-2)
+    # Shape [N, S, H * W]
+    attention = torch.softmax((down[..., :, None] + across[..., None, :]).flatten(-2), dim=-1)
+    return torch.bmm(attention.to(values.dtype), values)
+
+
 class ConvLSTM(nn.Module):
     """Convolutional LSTM over the map (Shi et al. 2015); gates of the input are computed for all ticks at once."""
 
     def __init__(self, inputs: int, belief: int) -> None:
         super().__init__()
         self.belief = belief
-        self.from_input = nn.Conv2d(inputs, 4 * belief, 3, padding=1)
+        self.from_input = nn.Conv2d(inputs, 4 * belief, 1)
         self.from_hidden = nn.Conv2d(belief, 4 * belief, 3, padding=1, bias=False)
         assert self.from_input.bias is not None
         with torch.no_grad():
@@ -160,8 +170,7 @@ class StateEstimator(nn.Module, Estimator):
         """
         super().__init__()
         self.config = c = EstimatorConfig(**config)  # pyright: ignore[reportArgumentType]
-        body = get_body(c.body)
-        self._mount, self._cell_size = body.camera, body.cell_size
+        self.body = get_body(c.body)
         self.encoder = FrameEncoder(c.stem, c.channels, c.blocks) if encoder is None else encoder
         self.attention = GeometricAttention()
         attended = len(ANCHORS) * (c.channels + 1) + FEATURES
@@ -205,7 +214,7 @@ class StateEstimator(nn.Module, Estimator):
             belief: at the start of the sequences.
         """
         b, t = features.shape[:2]
-        geometry = cell_geometry(pose.reshape(-1, 3), self._mount, self._cell_size)
+        geometry = cell_geometry(pose.reshape(-1, 3), self.body.camera, self.body.cell_size)
         relative, pixels, visible = (torch.from_numpy(g).to(features.device) for g in geometry)
         looked = self.attention(features.flatten(0, 1), relative, pixels, visible)
         cells = self.embed(torch.cat([looked, visible.to(looked.dtype), relative.to(looked.dtype)], dim=-1))

@@ -1,6 +1,6 @@
 """Where the cells of the map are, seen from the robot: the geometric inputs of the attention (paper C.1, Fig. 6).
 
-Shapes: N frames, M = 100 cells in row-major order, A = 4 anchors of a cell.
+Shapes: N frames, M = 100 cells in row-major order, A = 3 anchors of a cell.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from mujoban_sim.camera import FRAME_SIZE, CameraMount, project
 from mujoban_sim.grid import GRID_SIZE, cell_to_xy
 
 CELLS: Final = GRID_SIZE * GRID_SIZE
-ANCHORS: Final[tuple[tuple[float, float], ...]] = ((0.0, 0.0), (0.0, 0.3), (0.5, 0.15), (0.5, 0.45))
+ANCHORS: Final[tuple[tuple[float, float], ...]] = ((0.0, 0.0), (0.0, 0.3), (0.5, 0.25))
 """Points of a cell that show what it holds: (shift towards the robot, height), both in cells.
 
-Floor at the centre (target pads), the top of a box, the face of a box, and the face of a wall.
+Floor at the centre (target pads), the top of a box, and the face of a box or wall.
 """
 FEATURES: Final = 9
 """Relative coordinates of a cell; see `relative_features`."""

@@ -69,7 +69,7 @@ class Windows(NamedTuple):
 
 
 def choose_windows(batch: Batch, frames: int, length: int, rng: np.random.Generator) -> Windows:
-    """Draw instructions that begin within a batch until their ticks number `frames`; at least one if there is any.
+    """Draw instructions that begin within a batch until their ticks number `frames`.
 
     Args:
         batch: the batch.

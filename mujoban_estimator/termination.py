@@ -32,7 +32,7 @@ class TerminationConfig:
     """Size of the network, and how beta follows from its probability."""
 
     body: str = "ball"
-    stem: int = 24
+    stem: int = 16
     channels: int = 32
     blocks: int = 2
     camera: int = 64

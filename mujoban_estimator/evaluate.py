@@ -1,0 +1,167 @@
+"""Evaluate state estimator and control termination on recorded bags: `python -m mujoban_estimator.evaluate --bags DIR`.
+
+Both see what was recorded, the instructions and terminations included, whatever they would have said themselves.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mujoban_estimator import SHIPPED, SHIPPED_TERMINATION, load, load_termination
+from mujoban_estimator.bag_stream import ReadReport, find_bags, open_checked, stretches
+from mujoban_estimator.data import Batch, Batcher, Stretch
+from mujoban_estimator.encoder import FrameEncoder
+from mujoban_estimator.estimator import Belief, StateEstimator, probabilities
+from mujoban_estimator.learner import choose_windows
+from mujoban_estimator.metrics import MapScores, TerminationScores
+from mujoban_estimator.termination import ControlTermination
+from mujoban_sim.interfaces import INSTRUCTION_LIMIT, renew_rows
+
+_LENGTH = 480
+_STREAMS = 8
+_CHUNK = 256
+"""Frames encoded at once."""
+
+
+def evaluate(
+    estimator: StateEstimator,
+    termination: ControlTermination,
+    bags: Sequence[Path],
+    *,
+    max_ticks: int | None = None,
+    skip_damaged: bool = False,
+) -> dict[str, float]:
+    """Return rates of both modules on the given bags.
+
+    Args:
+        estimator: on any device.
+        termination: on the same.
+        bags: paths of bags.
+        max_ticks: stop after about so many ticks.
+        skip_damaged: leave out damaged parts of bags.
+
+    Raises:
+        mujoban_msgs_py.bags.BagError: if a bag cannot be read.
+    """
+    report = ReadReport()
+    streams = [_chain(bags[i::_STREAMS], report, skip_damaged) for i in range(min(_STREAMS, len(bags)))]
+    score = _Scoring(estimator, termination, len(streams))
+    for batch in Batcher(streams, _LENGTH, estimator.body):
+        score.add(batch)
+        if max_ticks is not None and report.ticks >= max_ticks:
+            break
+    return {**score.maps.report(), **score.ends.report(), "ticks": float(report.ticks)}
+
+
+def _chain(bags: Sequence[Path], report: ReadReport, skip_damaged: bool) -> Iterator[Stretch]:
+    for path in bags:
+        yield from stretches(open_checked(path, skip_damaged=skip_damaged), _LENGTH, report)
+
+
+class _Scoring:
+    """Runs both modules over batches and counts."""
+
+    def __init__(self, estimator: StateEstimator, termination: ControlTermination, streams: int) -> None:
+        self.maps, self.ends = MapScores(), TerminationScores()
+        self._estimator, self._termination = estimator, termination
+        self._belief = estimator.initial_belief(streams)
+        self._track = termination.odometry.initial(streams, termination.device)
+        self._rng = np.random.default_rng(0)
+
+    @torch.inference_mode()
+    def add(self, batch: Batch) -> None:
+        """Count a batch, which continues the one before."""
+        streams = len(batch.valid)
+        self._belief = renew_rows(self._belief, self._estimator.initial_belief(streams), batch.first)
+        fresh = self._termination.odometry.initial(streams, self._termination.device)
+        self._track = renew_rows(self._track, fresh, batch.first)
+        self._add_maps(batch)
+        self._add_ends(batch)
+
+    def _add_maps(self, batch: Batch) -> None:
+        updates = np.arange(0, batch.valid.shape[1], self._estimator.config.update_every)
+        features = _encode(self._estimator.encoder, batch.frame[:, updates], self._estimator.device)
+        output = self._estimator(features, batch.pose[:, updates], self._belief)
+        self._belief = Belief(*output.belief)
+        valid = batch.valid[:, updates]
+        self.maps.add(
+            probabilities(output.logits).cpu().numpy()[valid],
+            batch.abstract_state[:, updates][valid],
+            batch.in_view[:, updates][valid],
+            batch.seen[:, updates][valid],
+        )
+
+    def _add_ends(self, batch: Batch) -> None:
+        module = self._termination
+        device = module.device
+        instruction, proprio, terminated = (
+            torch.from_numpy(x).to(device) for x in (batch.instruction, batch.proprio, batch.terminated)
+        )
+        progress, self._track = module.odometry(proprio, instruction, terminated, self._track)
+        windows = choose_windows(batch, batch.valid.size, INSTRUCTION_LIMIT + 1, self._rng)
+        for start in range(0, len(windows.stream), _STREAMS):
+            part = slice(start, start + _STREAMS)
+            at = (windows.stream[part, None], windows.tick[part])
+            features = _encode(module.encoder, batch.frame[at], device)
+            recurrence = module.initial_recurrence(len(features))
+            output = module(features, progress[at], proprio[at], *recurrence)
+            probability = torch.sigmoid(output.logits).cpu().numpy()
+            for p, completed, valid in zip(probability, batch.completed[at], windows.valid[part], strict=True):
+                self.ends.add(p[valid], completed[valid], module.threshold)
+
+
+def _encode(encoder: FrameEncoder, frames: NDArray[np.uint8], device: torch.device) -> Tensor:
+    """Return features of frames [B, T, ...], [B, T, C, H, W]."""
+    flat = torch.from_numpy(frames.reshape(-1, *frames.shape[2:]))
+    features = torch.cat([encoder(chunk.to(device)) for chunk in flat.split(_CHUNK)])
+    return features.unflatten(0, frames.shape[:2])
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the command."""
+
+    bags: tuple[Path, ...]
+    """Bags, or folders of bags."""
+    estimator: Path = SHIPPED
+    termination: Path = SHIPPED_TERMINATION
+    max_ticks: int | None = None
+    threads: int = 1
+    device: str = "cpu"
+    skip_damaged: bool = False
+    """Leave damaged parts of bags out instead of refusing them."""
+    json: Path | None = None
+    """Write the report there instead of printing it."""
+
+
+def main() -> None:
+    """Run the command."""
+    options = tyro.cli(Options, prog="mujoban_estimator.evaluate", description=__doc__)
+    torch.set_num_threads(options.threads)
+    try:
+        result = evaluate(
+            load(options.estimator, options.device), load_termination(options.termination, options.device),
+            find_bags(options.bags), max_ticks=options.max_ticks, skip_damaged=options.skip_damaged,
+        )  # fmt: skip
+    except (ValueError, OSError) as error:
+        print(f"evaluate: error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    text = json.dumps({k: None if v != v else round(v, 5) for k, v in result.items()}, indent=2)
+    if options.json is None:
+        print(text)
+    else:
+        options.json.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
