@@ -28,6 +28,8 @@ PHYSICS_STEP: Final = 0.01
 SUBSTEPS: Final = round(CONTROL_PERIOD / PHYSICS_STEP)
 """Physics steps of one control step."""
 
+_SETTLING_TIME: Final = 2.0
+
 BOX_HALF_EXTENT: Final = (0.4, 0.4, 0.15)
 """Half edges of a box in cells."""
 BOX_MASS: Final = 2.5
@@ -171,6 +173,25 @@ def _foot_pair(index: int) -> str:
 def parked_position(index: int, cell_size: float) -> NDArray[np.float64]:
     """Return the slide joints (x, y, z) of an absent box in metres, [3]."""
     return np.array([_PARKING + 2 * index, _PARKING, 0.0]) * cell_size
+
+
+def settled_positions(model: mujoco.MjModel, max_boxes: int, body: Body) -> NDArray[np.float64]:
+    """Return the positions of parked boxes and a robot after their contacts have come to bear them, [nq].
+
+    Args:
+        model: a scene without walls.
+        max_boxes: K, boxes in its layout.
+        body: the robot's body.
+    """
+    data = mujoco.MjData(model)
+    root = BOX_COORDINATES * max_boxes
+    for k in range(max_boxes):
+        data.qpos[BOX_COORDINATES * k :][:BOX_COORDINATES] = parked_position(k, body.cell_size)
+    data.qpos[root:] = body.rest_qpos
+    # Off the pegs: the centre of a cell.
+    body.set_pose(data.qpos[root:], np.append(cell_to_xy([0, 0], body.cell_size), 0.0))
+    mujoco.mj_step(model, data, round(_SETTLING_TIME / PHYSICS_STEP))
+    return data.qpos.copy()
 
 
 class SceneCache:

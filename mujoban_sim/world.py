@@ -20,7 +20,7 @@ from mujoban_sim.camera import FRAME_SIZE
 from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
 from mujoban_sim.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, cell_to_xy, xy_to_cell
 from mujoban_sim.interfaces import GroundTruth, Observation
-from mujoban_sim.scene import BOX_COORDINATES, PHYSICS_STEP, SUBSTEPS, SceneCache, parked_position
+from mujoban_sim.scene import BOX_COORDINATES, SUBSTEPS, SceneCache, settled_positions
 from mujoban_sim.world_kernels import apply_torque, fill_abstract_state, update
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 _STAGE_NONE: Final = int(mujoco.mjtStage.mjSTAGE_NONE)
 _STAGE_VELOCITY: Final = int(mujoco.mjtStage.mjSTAGE_VEL)
-_SETTLING_TIME: Final = 2.0
 _HEADING_STREAM: Final = 1
 """Tells the heading's random stream from others that an episode's seed governs."""
 
@@ -55,8 +54,9 @@ class World:
     """B independent Mujoban worlds that step together at 20 Hz.
 
     A row is an episode: `reset` starts it, `instruct` tells which instruction it follows, `step` applies
-    torques. A row whose episode has ended (solved or truncated) stands still, without reward, until it is reset. The same level, seed and torques give the same values exactly, in
-    every process and whatever ran in the row before.
+    torques. A row whose episode has ended (solved or truncated) stands still, without reward, until it is
+    reset. The same level, seed and torques give the same values exactly, in every process and whatever ran in
+    the row before.
 
     The arrays are live: they change in place. Copy what you keep (`observation` and `truth` return copies).
 
@@ -162,18 +162,7 @@ class World:
         self._root = BOX_COORDINATES * self.max_boxes
         self._joint_qpos = np.array(self.body.joint_qpos, np.int64)
         self._joint_qvel = np.array(self.body.joint_qvel, np.int64)
-        self._rest_qpos = self._settle(empty)
-
-    def _settle(self, empty: mujoco.MjModel) -> NDArray[np.float64]:
-        """Return the positions, [nq], of parked boxes and a robot, once their contacts bear them."""
-        data = mujoco.MjData(empty)
-        for k in range(self.max_boxes):
-            data.qpos[BOX_COORDINATES * k :][:BOX_COORDINATES] = parked_position(k, self.body.cell_size)
-        data.qpos[self._root :] = self.body.rest_qpos
-        # Off the pegs: the centre of a cell.
-        self.body.set_pose(data.qpos[self._root :], np.append(cell_to_xy([0, 0], self.body.cell_size), 0.0))
-        mujoco.mj_step(empty, data, round(_SETTLING_TIME / PHYSICS_STEP))
-        return data.qpos.copy()
+        self._rest_qpos = settled_positions(empty, self.max_boxes, self.body)
 
     @property
     def completed(self) -> NDArray[np.bool_]:
