@@ -81,10 +81,10 @@ class LearnedPlanner(nn.Module, Planner):
     def forward(self, abstract_state: Tensor) -> PlannerOutput:
         """Return the heads' outputs for abstract states, float [B, N, N, 4] with values in [0, 1]."""
         planes = input_planes(abstract_state)
-        spread = propagate(planes)
-        inputs = torch.cat([planes, spread], 1) if self.propagation else planes
+        spread = propagate(planes) if self.propagation else None
+        inputs = planes if spread is None else torch.cat([planes, spread], 1)
         features = self.features(inputs.contiguous(memory_format=torch.channels_last))
-        return self.heads(features, planes, spread[:, 0] if self.propagation else None)
+        return self.heads(features, planes, None if spread is None else spread[:, 0])
 
     @property
     def inputs(self) -> int:

@@ -129,10 +129,8 @@ class SampleBuffer:
 def make_batch(samples: Samples, symmetry: NDArray[np.int64]) -> Batch:
     """Return the tensors of samples, each under its own symmetry, int64 [S] in 0..7."""
     n = len(samples.agent)
-    state = np.zeros((n, GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32)
     plan = np.empty((n, CELLS), np.int64)
     masks = np.empty((3, n, INSTRUCTIONS), np.bool_)
-    _fill_states(samples.wall, samples.target, samples.box, samples.agent, symmetry, _SOURCES, state)
     _fill_labels(
         samples.plan,
         np.stack([samples.right, samples.dead_known, samples.dead]),
@@ -143,7 +141,7 @@ def make_batch(samples: Samples, symmetry: NDArray[np.int64]) -> Batch:
         masks,
     )
     return Batch(
-        torch.from_numpy(state),
+        state_tensor(samples.wall, samples.target, samples.box, samples.agent, symmetry),
         torch.from_numpy(masks[0]),
         torch.from_numpy(plan).view(n, INTERIOR, INTERIOR),
         torch.from_numpy(samples.value.copy()),
@@ -155,6 +153,21 @@ def make_batch(samples: Samples, symmetry: NDArray[np.int64]) -> Batch:
 
 _SOURCES = cell_sources(INTERIOR)
 _INSTRUCTION_MAPS = np.array([instruction_map(s) for s in range(SYMMETRIES)], np.int64)
+
+
+def state_tensor(
+    wall: NDArray[np.uint64],
+    target: NDArray[np.uint64],
+    box: NDArray[np.uint64],
+    agent: NDArray[np.uint8],
+    symmetry: NDArray[np.int64] | None = None,
+) -> Tensor:
+    """Return abstract states, float32 [S, N, N, 4], of boards [S], each under its symmetry if given."""
+    n = len(agent)
+    state = np.zeros((n, GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32)
+    symmetry = np.zeros(n, np.int64) if symmetry is None else symmetry
+    _fill_states(wall, target, box, agent, symmetry, _SOURCES, state)
+    return torch.from_numpy(state)
 
 
 def _next_pushes(next_push: NDArray[np.uint8], symmetry: NDArray[np.int64]) -> NDArray[np.int64]:

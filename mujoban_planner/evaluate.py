@@ -1,0 +1,143 @@
+"""Evaluate a planner under the abstract rules: `python -m mujoban_planner.evaluate --difficulty 5 --episodes 1000`."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from mujoban_planner import SHIPPED, load
+from mujoban_planner.abstract_env import MOVE_LIMIT
+from mujoban_planner.lookahead import LookAheadPlanner
+from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.play import Boards, play
+from mujoban_rl.stats import wilson_interval
+from mujoban_rl.weights import digest
+from mujoban_sim.generator import TEST_SEEDS, generate_batch
+from mujoban_sim.grid import DIFFICULTIES
+from mujoban_sim.levels import LevelBatch, read_levels, stack_levels
+from mujoban_sim.solver import Status, solve_batch
+
+
+@dataclass(frozen=True)
+class Options:
+    """Play levels with a planner; an episode has at most 120 moves."""
+
+    levels: Path | None = None
+    """Boxoban text file; generated levels otherwise."""
+    difficulty: int = 5
+    """Difficulty of generated levels, 1 to 5."""
+    episodes: int = 1000
+    """Levels played; all of a file when 0."""
+    seed: int = 1000
+    """Seed of the first generated level; the next ones follow."""
+    thinking: int = 1
+    """Repeats of the recurrent core (symmetric views of the residual network) per decision, relative to training."""
+    look_ahead: bool = False
+    """Search under the abstract rules, guided by the network."""
+    expansions: int = 400
+    """Network evaluations per search at most."""
+    weights: Path = SHIPPED
+    """Weights with their record."""
+    optimal: bool = True
+    """Compare moves with optimal solutions."""
+    device: str = "cpu"
+    """Device of the network."""
+    threads: int = 1
+    """Threads of the network on a CPU."""
+    json: Path | None = None
+    """Where the figures are written."""
+
+    def boards(self) -> Boards:
+        """Return the levels.
+
+        Raises:
+            ValueError: If an option is out of range or the file holds no levels.
+        """
+        if self.levels is not None:
+            levels = read_levels(self.levels)
+            return _boards(stack_levels(levels[: self.episodes or None]))
+        if self.difficulty not in DIFFICULTIES:
+            raise ValueError(f"difficulty {self.difficulty}: expected one of {', '.join(map(str, DIFFICULTIES))}")
+        seeds = range(self.seed, self.seed + self.episodes)
+        if self.episodes < 1 or seeds[0] not in TEST_SEEDS or seeds[-1] not in TEST_SEEDS:
+            raise ValueError(f"{self.episodes} episodes from seed {self.seed}: expected at least one, seeds below 10^7")
+        return _boards(generate_batch(self.difficulty, seeds))
+
+
+def evaluate(planner: LearnedPlanner, boards: Boards, options: Options) -> dict[str, Any]:
+    """Return the figures of a planner on levels."""
+    planner.thinking = options.thinking
+    player = LookAheadPlanner(planner, options.expansions) if options.look_ahead else planner
+    start = time.perf_counter()
+    # In chunks, so that memory stays small whatever the number of levels.
+    games = [play(player, boards.take(rows)) for rows in np.array_split(np.arange(len(boards.player)), _chunks(boards))]
+    elapsed = time.perf_counter() - start
+    moves = np.concatenate([game.moves for game in games])
+    solved = moves >= 0
+    decisions = sum(game.decisions for game in games)
+    low, high = wilson_interval(int(solved.sum()), len(moves))
+    result: dict[str, Any] = {
+        "episodes": len(moves),
+        "solve_rate": float(solved.mean()),
+        "solve_interval": [low, high],
+        "mean_moves": float(moves[solved].mean()) if solved.any() else None,
+        "move_limit": MOVE_LIMIT,
+        "decisions_per_second": decisions / elapsed,
+        "architecture": type(planner).__name__,
+        "thinking": options.thinking,
+        "look_ahead": options.look_ahead,
+        "levels": str(options.levels) if options.levels else None,
+        "difficulty": None if options.levels else options.difficulty,
+        "seed": None if options.levels else options.seed,
+        "weights": {"path": options.weights.name, "digest": digest(options.weights)},
+    }
+    if isinstance(player, LookAheadPlanner):
+        result["expansions"] = options.expansions
+        result["evaluations_per_level"] = player.evaluations / len(moves)
+    if options.optimal and solved.any():
+        solutions = solve_batch(LevelBatch(*boards.take(solved)))
+        known = solutions.status == Status.SOLVED
+        result["moves_over_optimal"] = float(moves[solved][known].sum() / solutions.length[known].sum())
+    return result
+
+
+def _boards(batch: LevelBatch) -> Boards:
+    return Boards(batch.wall, batch.target, batch.boxes, batch.player)
+
+
+def _chunks(boards: Boards, size: int = 1024) -> int:
+    return -(-len(boards.player) // size)
+
+
+def main() -> None:
+    """Run the command line."""
+    options = tyro.cli(Options)
+    torch.set_num_threads(options.threads)
+    try:
+        boards = options.boards()
+        planner = load(options.weights, options.device)
+        result = evaluate(planner, boards, options)
+    except (ValueError, OSError) as error:
+        print(f"evaluate: {error}", file=sys.stderr)
+        sys.exit(2)
+    low, high = result["solve_interval"]
+    print(f"solve_rate            {result['solve_rate']:.4f}  [{low:.4f}, {high:.4f}]  n = {result['episodes']}")
+    if "moves_over_optimal" in result:
+        print(f"moves over optimal    {result['moves_over_optimal']:.3f}")
+    print(f"decisions per second  {result['decisions_per_second']:.0f}")
+    if options.look_ahead:
+        print(f"evaluations per level {result['evaluations_per_level']:.1f}  (at most {options.expansions} per search)")
+    if options.json is not None:
+        options.json.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
