@@ -1,7 +1,7 @@
 """Judge the controller: `python -m mujoban_controller.evaluate --episodes 512 --seed 1000`.
 
-Whole episodes of a solver's plans with exact termination signals; prints JSON. `--driver` compares the camera policy with
-the scripted driver or a privileged teacher under the same judgement, which shows the loss from distillation.
+Whole episodes of a solver's plans with exact termination signals; prints JSON. `--driver` compares the camera policy
+with the scripted driver or a privileged teacher under the same judgement, which shows the loss from distillation.
 """
 
 from __future__ import annotations

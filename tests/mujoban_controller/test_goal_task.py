@@ -1,0 +1,136 @@
+"""The goal task: instructions, rewards, episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mujoban_controller.drivers import scripted_driver
+from mujoban_controller.goal_features import feature_size, privileged_features
+from mujoban_controller.goal_task import GoalTask, GoalTaskConfig, judging_config
+from mujoban_controller.judge import SeededEpisodes, judge
+from mujoban_sim.goals import GoalKind
+from mujoban_sim.grid import Instruction
+from mujoban_sim.interfaces import Planner
+from mujoban_sim.oracles import OracleController, OraclePlanner
+
+
+class Stubborn(Planner):
+    """Always gives the same instruction."""
+
+    def __init__(self, instruction):
+        self.instruction = instruction
+
+    def initial_memory(self, batch):
+        return ()
+
+    def decide(self, abstract_state, memory):
+        return np.full(len(abstract_state), self.instruction), memory
+
+
+def make(config=None, planner=None, seed=0, **changes):
+    config = dataclasses.replace(config or GoalTaskConfig(batch=4, difficulty=1), **changes)
+    episodes = SeededEpisodes(config.difficulty, 10_000_000 + seed)
+    return GoalTask(config, planner or OraclePlanner(), episodes, np.random.default_rng(seed))
+
+
+def play(task, steps, driver=scripted_driver):
+    return [task.step(driver(task)) for _ in range(steps)]
+
+
+def idle(task):
+    return np.zeros((task.world.batch, 2), np.float32)
+
+
+def test_a_good_driver_is_rewarded_for_each_instruction():
+    results = play(make(misaligned=0.0), 150)
+    outcomes = [o for r in results for o in r.outcomes]
+    assert len(outcomes) > 10
+    assert all(o.completed for o in outcomes)
+    assert sum(r.reward.sum() for r in results) == pytest.approx(4.0 * len(outcomes), abs=0.15 * len(outcomes))
+
+
+def test_an_idle_robot_fails_moves_after_the_limit_and_is_given_up_after_some():
+    task = make(planned=1.0, astray=0.0, misaligned=0.0, patience=2)
+    results = play(task, 240, idle)
+    failures = [(t + 1, r) for t, r in enumerate(results) if r.outcomes]
+    assert [t for t, _ in failures] == [120, 240]
+    assert failures[0][1].reward == pytest.approx(np.full(4, -5.0))
+    assert failures[0][1].discount.tolist() == [0.0] * 4
+    assert [o.completed for o in failures[0][1].outcomes] == [False] * 4
+    assert len(failures[1][1].episodes) == 4
+    assert task.first.all()
+    assert not task.terminated.any()
+
+
+def test_the_signal_comes_with_the_next_instruction_and_says_what_the_rule_said():
+    task = make(misaligned=0.0, planned=1.0, astray=0.0)
+    for _ in range(120):
+        result = task.step(scripted_driver(task))
+        inputs = task.observe(camera=False)
+        ended = {o.row for o in result.outcomes} - {e.row for e in result.episodes}
+        assert ended == set(np.flatnonzero(inputs.terminated))
+        assert set(np.flatnonzero(inputs.truth.completed)) >= {
+            o.row for o in result.outcomes if o.completed and o.row in ended
+        }
+
+
+def test_planned_rows_follow_the_planner_and_random_ones_do_not():
+    planned = make(planned=1.0, astray=0.0, planner=Stubborn(Instruction.WEST))
+    assert set(planned.instruction) == {Instruction.WEST}
+    random = make(planned=0.0, planner=Stubborn(Instruction.WEST), batch=32)
+    assert len(set(random.instruction.tolist())) > 2
+
+
+def test_misaligned_starts_leave_nothing_in_collision():
+    task = make(batch=32, difficulty=5, misaligned=1.0)
+    start = task.world.box_position.copy()
+    assert np.abs(task.world.pose[:, :2] % 1.0 - 0.5).max() > 0.1
+    for _ in range(10):
+        task.world.step(np.zeros((32, 2), np.float32))
+    assert np.abs(task.world.box_position - start).max() < 0.02
+
+
+def test_the_same_seed_gives_the_same_task():
+    first, second = make(seed=3), make(seed=3)
+    a, b = play(first, 60), play(second, 60)
+    assert all(np.array_equal(x.reward, y.reward) for x, y in zip(a, b, strict=True))
+    assert np.array_equal(first.world.pose, second.world.pose)
+
+
+def test_features_do_not_depend_on_the_direction_of_the_instruction():
+    # The same situation, turned by 90 degrees, looks the same to critic and teacher.
+    views = []
+    for direction, heading in ((Instruction.EAST, 0.0), (Instruction.NORTH, np.pi / 2), (Instruction.WEST, np.pi)):
+        task = make(planned=1.0, astray=0.0, misaligned=0.0, planner=Stubborn(direction), batch=8)
+        world = task.world
+        moves = np.flatnonzero(world.goals.kind == GoalKind.MOVE)
+        pose = world.pose.astype(float)
+        pose[:, 2] = heading
+        world.place(np.arange(8), pose, world.box_position)
+        features = privileged_features(world, task.elapsed)
+        assert features.shape == (8, feature_size(world.body.proprio_size))
+        views.append(features[moves[0], world.body.proprio_size : -23])
+    assert views[0] == pytest.approx(views[1], abs=1e-5)
+    assert views[0] == pytest.approx(views[2], abs=1e-5)
+
+
+def test_the_scripted_driver_solves_whole_levels():
+    report = judge(scripted_driver, OraclePlanner(), episodes=4, first_seed=7, difficulty=2)
+    assert report["success_rate"] == 1.0
+    assert report["lost"] == {}
+    assert report["instructions"]["kinds"]["move"]["success_rate"] == 1.0
+
+
+def test_controllers_and_drivers_are_judged_alike():
+    report = judge(OracleController(), OraclePlanner(), episodes=2, first_seed=7, difficulty=1)
+    assert report["success_rate"] == 1.0
+
+
+def test_settings_that_contradict_the_evaluation_are_refused():
+    with pytest.raises(ValueError, match=r"tolerance 0\.2"):
+        GoalTaskConfig(tolerance=0.2)
+    with pytest.raises(ValueError, match="difficulty 9"):
+        judging_config(4, difficulty=9)
