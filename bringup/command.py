@@ -11,11 +11,12 @@ from typing import NoReturn
 
 import numpy as np
 
-from mujoban_rl.weights import digest
+from mujoban_rl.weights import WeightsError, digest
 from mujoban_sim.episodes import Episodes
 from mujoban_sim.grid import DIFFICULTIES
 from mujoban_sim.interfaces import Module
 from mujoban_sim.plugins import LEARNED, ORACLE, ROLES, load_module, shipped_weights
+from mujoban_sim.rendering import RenderingError
 from mujoban_sim.sense_plan_act import SensePlanAct
 from mujoban_sim.solver import Status, solve_levels
 
@@ -35,7 +36,7 @@ def run_command(prog: str, command: Callable[[], int]) -> NoReturn:
     """Run a command and leave with its exit status; bad input is one line on stderr and status 2."""
     try:
         status = command()
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RenderingError) as error:
         print(f"{prog}: error: {' '.join(str(error).split())}", file=sys.stderr)
         status = USAGE_ERROR
     except KeyboardInterrupt:
@@ -67,8 +68,17 @@ class Choice:
         return load_module(self.role, self.source, self.weights, device)
 
     def identity(self) -> str:
-        """Return the SHA-256 digest of the weights in use, or what stands in for a learned module."""
-        return digest(self.weights or shipped_weights(self.role)) if self.source == LEARNED else self.source
+        """Return the SHA-256 digest of the weights in use, or what stands in for a learned module.
+
+        Raises:
+            WeightsError: If the weights are missing.
+        """
+        if self.source != LEARNED:
+            return self.source
+        path = self.weights or shipped_weights(self.role)
+        if not path.is_file():
+            raise WeightsError(f"no weights of the {self.role} at {path}: expected a .safetensors file")
+        return digest(path)
 
 
 @dataclass(frozen=True)

@@ -89,6 +89,8 @@ class MonitorNode(Node):
 
         def receive(message: Any) -> None:
             stamp = stamp_of(message)
+            if stamp <= self._joined:
+                return
             joined = self._join.add(topic.name, stamp, message)
             if joined is not None:
                 self._joined = stamp

@@ -19,7 +19,7 @@ from bringup.graph import NODES, RESPAWN_PERIOD, Processes, make_node
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from bringup.results import EpisodeResult
-from mujoban_msgs_py.tick_node import confine_discovery
+from mujoban_msgs_py.tick_node import confine_discovery, spin
 from mujoban_sim.episodes import Episodes
 
 
@@ -95,7 +95,7 @@ def play(
         nodes = [] if options.processes else [add(make_node(name, parameters[name])) for name in NODES]
         if on_refresh is not None:
             monitor.create_timer(refresh_period, lambda: on_refresh(monitor, monitor.results))
-        executor.spin_until_future_complete(monitor.finished)
+        spin(executor, monitor.finished)
         outcome.results = monitor.results
         outcome.ticks, outcome.ticks_per_second = monitor.ticks, monitor.ticks_per_second
         for node in nodes:

@@ -8,7 +8,6 @@ neighbour which was restarted in between receives what it has missed.
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from abc import abstractmethod
 from collections import Counter
@@ -18,11 +17,12 @@ from typing import Any, NamedTuple
 
 import rclpy
 from mujoban_msgs.msg import Episode
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 
 from mujoban_msgs_py.conversions import stamp_of
 from mujoban_msgs_py.synchroniser import Synchroniser
@@ -30,6 +30,8 @@ from mujoban_msgs_py.topics import EPISODE, Topic
 
 LOG_PERIOD = 5.0
 """Seconds between two reports of bad input from one place."""
+SIGNAL_PERIOD = 0.2
+"""Seconds within which a node heeds a signal."""
 PATIENCE = 2
 """Repeated offers of a tick after which a node answers without what it still waits for."""
 
@@ -152,6 +154,16 @@ def confine_discovery() -> None:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
+def spin(executor: Executor, until: Future[Any]) -> None:
+    """Run an executor until a future is done.
+
+    An `EventsExecutor` must be given a deadline: without one it waits until the end of its clock, which overflows,
+    and then polls at full load while its other threads starve. Between two deadlines signals are looked after.
+    """
+    while not until.done():
+        executor.spin_until_future_complete(until, timeout_sec=SIGNAL_PERIOD)
+
+
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     """Run one node in a process of its own until it is interrupted.
 
@@ -163,14 +175,13 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
         Exit status: 0, or 2 after one line on stderr about bad input.
     """
     confine_discovery()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     rclpy.init(args=None if args is None else list(args))
     node = None
     try:
         node = make()
         executor = EventsExecutor()
         executor.add_node(node)
-        executor.spin()
+        spin(executor, Future())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (ValueError, OSError) as error:

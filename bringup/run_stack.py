@@ -1,0 +1,90 @@
+"""Play Mujoban: start the graph, show what it does, sum up (`python bringup/run_stack.py`)."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.live import Live
+
+from bringup.command import (
+    Parser,
+    add_episode_options,
+    add_module_options,
+    episodes_from,
+    import_from_here,
+    run_command,
+    stack_from,
+)
+from bringup.monitor import MonitorNode
+from bringup.results import EpisodeResult, report, write_report
+from bringup.stack import Outcome, PlayOptions, play
+from bringup.view import live_view, summary
+
+PROG = "run_stack.py"
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """Read the command line."""
+    parser = Parser(PROG, description="Play Mujoban through the ROS graph; without options, one hard episode.")
+    add_episode_options(parser)
+    add_module_options(parser)
+    parser.add_argument(
+        "--realtime", nargs="?", type=_speed, const=1.0, default=0.0, metavar="SPEED",
+        help="pace the world by the clock, SPEED (1) times as fast as reality, instead of in lockstep",
+    )  # fmt: skip
+    parser.add_argument("--processes", action="store_true", help="run each node in a process of its own")
+    parser.add_argument("--headless", action="store_true", help="show no live view")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record all topics into a bag")
+    parser.add_argument("--video", type=Path, metavar="FILE", help="write an .mp4 of the robot's view and from above")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there")
+    return parser.parse_args(arguments)
+
+
+def _speed(text: str) -> float:
+    speed = float(text)
+    if not (0 < speed < float("inf")):
+        raise argparse.ArgumentTypeError(f"{text} is no speed: expected a number above 0")
+    return speed
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    options = parse(arguments)
+    import_from_here()
+    episodes, stack = episodes_from(options), stack_from(options)
+    weights = stack.identities()
+    console = Console()
+    play_options = PlayOptions(options.realtime, options.processes, options.record, options.video)
+    if options.headless:
+        outcome = play(stack, episodes, play_options)
+    else:
+        with Live(console=console, auto_refresh=False) as live:
+
+            def refresh(monitor: MonitorNode, results: Sequence[EpisodeResult]) -> None:
+                live.update(live_view(monitor.episode, monitor.latest, results), refresh=True)
+
+            outcome = play(stack, episodes, play_options, on_refresh=refresh)
+    content = report(outcome.results, weights, ticks_per_second=outcome.ticks_per_second, counts=dict(outcome.counts))
+    _sum_up(console, outcome, content["success_interval"])
+    if options.json is not None:
+        write_report(content, options.json)
+    return 0
+
+
+def _sum_up(console: Console, outcome: Outcome, interval: Sequence[float]) -> None:
+    console.print(summary(outcome.results))
+    solved, total = sum(r.solved for r in outcome.results), len(outcome.results)
+    low, high = (100 * bound for bound in interval)
+    console.print(
+        f"solved {solved} of {total} ({100 * solved / total:.1f} %, 95 % interval {low:.1f} to {high:.1f} %), "
+        f"{outcome.ticks_per_second:.0f} ticks/s"
+    )
+    for event, count in sorted(outcome.counts.items()):
+        console.print(f"{event}: {count}")
+
+
+if __name__ == "__main__":
+    run_command(PROG, main)
