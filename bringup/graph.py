@@ -7,11 +7,13 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TypeVar
 
 from rclpy.context import Context
+from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -20,10 +22,13 @@ from bringup.parameters import Parameters, write_parameters
 from mujoban_controller.node import ControllerNode
 from mujoban_estimator.node import EstimatorNode
 from mujoban_estimator.termination_node import TerminationNode
+from mujoban_msgs_py.module_node import ModuleNode
 from mujoban_planner.node import PlannerNode
 from mujoban_sim.node import SimulatorNode
 
-NODES: dict[str, type[Node]] = {
+NodeT = TypeVar("NodeT", bound=Node)
+GraphNode = SimulatorNode | ModuleNode
+NODES: dict[str, type[GraphNode]] = {
     "simulator": SimulatorNode,
     "estimator": EstimatorNode,
     "termination": TerminationNode,
@@ -42,14 +47,67 @@ class GraphError(RuntimeError):
     """A node of the graph could not start; it has said why."""
 
 
-def make_node(name: str, parameters: dict[str, Any], context: Context | None = None) -> Node:
-    """Return a node of the graph with the given parameters.
+class InProcess:
+    """All nodes in this process on one executor.
 
-    Raises:
-        ValueError: If a parameter or what it names is bad.
+    Attributes:
+        executor: Runs the nodes.
+        nodes: The nodes of the graph by name.
     """
-    overrides = [Parameter(key, value=value) for key, value in parameters.items()]
-    return NODES[name](parameter_overrides=overrides, context=context)
+
+    def __init__(
+        self, parameters: Parameters, names: Iterable[str] = NODES, *, context: Context | None = None
+    ) -> None:
+        """Start the named nodes of the graph.
+
+        Args:
+            parameters: Of each node.
+            names: Nodes to start.
+            context: The ROS context, if not the default one.
+
+        Raises:
+            ValueError: If a module or what a parameter names is bad.
+        """
+        self.executor = EventsExecutor(context=context)
+        self.nodes: dict[str, GraphNode] = {}
+        self._parameters = parameters
+        self._context = context
+        self._others: list[Node] = []
+        for name in names:
+            self.start(name)
+
+    def __enter__(self) -> InProcess:
+        """Return this graph."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Stop all nodes."""
+        for node in (*self._others, *self.nodes.values()):
+            self.executor.remove_node(node)
+            node.destroy_node()
+        self.executor.shutdown()
+
+    def start(self, name: str) -> None:
+        """Start a node of the graph."""
+        overrides = [Parameter(key, value=value) for key, value in self._parameters[name].items()]
+        self.nodes[name] = NODES[name](parameter_overrides=overrides, context=self._context)
+        self.executor.add_node(self.nodes[name])
+
+    def stop(self, name: str) -> None:
+        """End a node of the graph, at once and without a word."""
+        node = self.nodes.pop(name)
+        self.executor.remove_node(node)
+        node.destroy_node()
+
+    def add(self, node: NodeT) -> NodeT:
+        """Run another node on the executor, and end it with the graph."""
+        self._others.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def counts(self) -> Counter[str]:
+        """Return the events that a user should know of, by node and kind."""
+        return Counter({f"{name}: {kind}": n for name, node in self.nodes.items() for kind, n in node.counts.items()})
 
 
 class Processes:

@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import rclpy
-from rclpy.experimental import EventsExecutor
-from rclpy.node import Node
 
 from bringup.command import Stack
 from bringup.domain import claim_domain
-from bringup.graph import NODES, RESPAWN_PERIOD, Processes, make_node
+from bringup.graph import NODES, RESPAWN_PERIOD, InProcess, Processes
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from bringup.results import EpisodeResult
@@ -37,14 +34,14 @@ class PlayOptions:
     """Video file to write."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Outcome:
     """What came of a run of the graph."""
 
-    results: list[EpisodeResult] = field(default_factory=list)
-    ticks: int = 0
-    ticks_per_second: float = 0.0
-    counts: Counter[str] = field(default_factory=Counter)
+    results: list[EpisodeResult]
+    ticks: int
+    ticks_per_second: float
+    counts: Counter[str]
     """Events of the nodes that a user should know of."""
 
 
@@ -70,7 +67,6 @@ def play(
         GraphError: If a node's process could not start.
     """
     options = options or PlayOptions()
-    outcome = Outcome()
     parameters = graph_parameters(
         stack, episodes, realtime=options.realtime, await_recorder=options.record is not None and not options.realtime
     )
@@ -79,25 +75,13 @@ def play(
         exits.enter_context(claim_domain())
         rclpy.init()
         exits.callback(rclpy.try_shutdown)
-        executor = EventsExecutor()
-        exits.callback(executor.shutdown)
-
-        def add(node: Node) -> Any:
-            exits.callback(node.destroy_node)
-            executor.add_node(node)
-            return node
-
-        monitor: MonitorNode = add(MonitorNode(len(episodes)))
+        graph = exits.enter_context(InProcess(parameters, () if options.processes else NODES))
+        monitor = graph.add(MonitorNode(len(episodes)))
         if options.processes:
             processes = exits.enter_context(Processes(parameters))
             monitor.create_timer(RESPAWN_PERIOD, processes.supervise)
-            outcome.counts = processes.restarts
-        nodes = [] if options.processes else [add(make_node(name, parameters[name])) for name in NODES]
         if on_refresh is not None:
             monitor.create_timer(refresh_period, lambda: on_refresh(monitor, monitor.results))
-        spin(executor, monitor.finished)
-        outcome.results = monitor.results
-        outcome.ticks, outcome.ticks_per_second = monitor.ticks, monitor.ticks_per_second
-        for node in nodes:
-            outcome.counts.update({f"{node.get_name()}: {kind}": n for kind, n in node.counts.items()})
-    return outcome
+        spin(graph.executor, monitor.finished)
+        counts = processes.restarts if options.processes else graph.counts()
+        return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts)
