@@ -43,7 +43,7 @@ STOP_TIMEOUT = 5.0
 """Seconds that a process has to end when it is asked to."""
 
 
-class GraphError(RuntimeError):
+class GraphError(ValueError):
     """A node of the graph could not start; it has said why."""
 
 

@@ -79,6 +79,11 @@ class MonitorNode(Node):
             self.create_subscription(topic.type, topic.name, self._receiver(topic, raw), qos, raw=raw)
 
     @property
+    def stamp(self) -> int:
+        """Simulated time of the latest message about the episode [ns]."""
+        return 0 if self.episode is None else conversions.stamp_of(self.episode)
+
+    @property
     def ticks_per_second(self) -> float:
         """Ticks answered by the graph per second of wall time."""
         seconds = self._ended - self._started

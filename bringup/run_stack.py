@@ -38,9 +38,17 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--processes", action="store_true", help="run each node in a process of its own")
     parser.add_argument("--headless", action="store_true", help="show no live view")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record all topics into a bag")
+    parser.add_argument("--episodes-per-file", type=_positive, default=32, metavar="N", help="of the bag")
     parser.add_argument("--video", type=Path, metavar="FILE", help="write an .mp4 of the robot's view and from above")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there")
     return parser.parse_args(arguments)
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text} is too small: expected at least 1")
+    return number
 
 
 def _speed(text: str) -> float:
@@ -57,7 +65,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     episodes, stack = episodes_from(options), stack_from(options)
     weights = stack.identities()
     console = Console()
-    play_options = PlayOptions(options.realtime, options.processes, options.record, options.video)
+    play_options = PlayOptions(
+        realtime=options.realtime,
+        processes=options.processes,
+        record=options.record,
+        episodes_per_file=options.episodes_per_file,
+        video=options.video,
+    )
     if options.headless:
         outcome = play(stack, episodes, play_options)
     else:

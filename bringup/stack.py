@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -9,15 +10,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import rclpy
+from rclpy.executors import Executor
+from rclpy.parameter import Parameter
 
 from bringup.command import Stack
 from bringup.domain import claim_domain
 from bringup.graph import NODES, RESPAWN_PERIOD, InProcess, Processes
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
+from bringup.recorder import RecorderNode
 from bringup.results import EpisodeResult
+from bringup.video import EDGE, VideoNode
 from mujoban_msgs_py.tick_node import confine_discovery, spin
+from mujoban_sim.camera import FRAME_SIZE
 from mujoban_sim.episodes import Episodes
+
+DRAIN_TIMEOUT = 5.0
+"""Seconds that recorder and video have for the last tick."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +38,9 @@ class PlayOptions:
     processes: bool = False
     """One process for each node."""
     record: Path | None = None
-    """Directory of the bag to write."""
+    """Folder of the bag to write."""
+    episodes_per_file: int = 32
+    """Episodes in one file of the bag."""
     video: Path | None = None
     """Video file to write."""
 
@@ -68,7 +79,11 @@ def play(
     """
     options = options or PlayOptions()
     parameters = graph_parameters(
-        stack, episodes, realtime=options.realtime, await_recorder=options.record is not None and not options.realtime
+        stack,
+        episodes,
+        realtime=options.realtime,
+        await_recorder=options.record is not None,
+        top_camera_size=FRAME_SIZE if options.video is None else EDGE,
     )
     confine_discovery()
     with ExitStack() as exits:
@@ -77,11 +92,29 @@ def play(
         exits.callback(rclpy.try_shutdown)
         graph = exits.enter_context(InProcess(parameters, () if options.processes else NODES))
         monitor = graph.add(MonitorNode(len(episodes)))
+        listeners: list[RecorderNode | VideoNode] = []
+        if options.record is not None:
+            listeners.append(graph.add(_recorder(options.record, options.episodes_per_file)))
+        if options.video is not None:
+            listeners.append(graph.add(VideoNode(options.video)))
         if options.processes:
             processes = exits.enter_context(Processes(parameters))
             monitor.create_timer(RESPAWN_PERIOD, processes.supervise)
         if on_refresh is not None:
             monitor.create_timer(refresh_period, lambda: on_refresh(monitor, monitor.results))
         spin(graph.executor, monitor.finished)
+        _drain(graph.executor, listeners, monitor.stamp)
         counts = processes.restarts if options.processes else graph.counts()
         return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts)
+
+
+def _drain(executor: Executor, listeners: Sequence[RecorderNode | VideoNode], stamp: int) -> None:
+    """Let those who write files receive what was published last."""
+    deadline = time.monotonic() + DRAIN_TIMEOUT
+    while any(listener.written < stamp for listener in listeners) and time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=0.05)
+
+
+def _recorder(path: Path, episodes_per_file: int) -> RecorderNode:
+    values = {"path": str(path), "episodes_per_file": episodes_per_file}
+    return RecorderNode(parameter_overrides=[Parameter(name, value=value) for name, value in values.items()])

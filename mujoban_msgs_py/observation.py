@@ -13,6 +13,9 @@ from mujoban_msgs_py.topics import Topic
 from mujoban_sim.camera import camera_intrinsics
 from mujoban_sim.world import World
 
+_NEEDED = (topics.EPISODE, topics.CAMERA, topics.PROPRIO, topics.POSE)
+"""What the modules cannot do without."""
+
 
 class TickLabel(NamedTuple):
     """What names a tick besides the state of the world."""
@@ -57,6 +60,11 @@ class ObservationPublisher:
             topics.TOP_CAMERA: self._top_camera,
         }
         self._on_demand = {*topics.TRUTH_TOPICS, topics.TOP_CAMERA, topics.CAMERA_INFO}
+
+    def matched(self, *, everything: bool) -> bool:
+        """Tell whether somebody subscribes to what the modules need, or to everything."""
+        needed = self._publishers if everything else _NEEDED
+        return all(self._publishers[topic].get_subscription_count() for topic in needed)
 
     def publish(self, label: TickLabel) -> None:
         """Publish the world as it is now."""

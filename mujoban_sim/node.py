@@ -149,11 +149,11 @@ class SimulatorNode(Node):
     # Starting
 
     def _start_when_complete(self) -> None:
-        """Begin once somebody publishes torques and instructions, and a recorder is there if one is awaited."""
-        needed = [topics.TORQUE, topics.INSTRUCTION]
-        if self._settings["await_recorder"]:
-            needed.append(topics.RECORDED)
-        if not all(self.count_publishers(topic.name) for topic in needed):
+        """Begin once the modules listen and answer, and the recorder as well if one is awaited."""
+        recorded = self._settings["await_recorder"]
+        needed = (topics.TORQUE, topics.INSTRUCTION, *([topics.RECORDED] if recorded else []))
+        answering = all(self.count_publishers(topic.name) for topic in needed)
+        if not (answering and self._observation.matched(everything=recorded)):
             return
         self._start_timer.cancel()
         self._started = time.perf_counter()

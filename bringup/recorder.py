@@ -1,0 +1,129 @@
+"""The node that records the graph into a bag (`python -m bringup.recorder --ros-args -p path:=DIR`)."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from mujoban_msgs.msg import Episode
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+
+from bringup.raw import raw_stamp
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.bags import BagWriter
+from mujoban_msgs_py.tick_node import live_qos, run_node
+from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
+
+HELD_TICKS = 40
+"""Unfinished ticks kept in real time, where answers may be late: 2 s."""
+QUEUE_DEPTH = 1024
+
+
+class RecorderNode(Node):
+    """Writes every tick of the graph, its topics in a fixed order and with simulated time as log time.
+
+    A tick is written when all its topics have arrived; then `/recorded` says so. A simulator that awaits this in
+    lockstep loses nothing. In real time a tick is written as it is when it has become too old, and what it lacks is
+    counted. Repeated messages are written once.
+
+    Parameters:
+        path: Folder of the bag, which must not exist yet.
+        episodes_per_file: Episodes after which the next file of the bag begins.
+
+    Attributes:
+        counts: Messages that were never received, by topic.
+        written: Stamp of the latest tick in the bag [ns].
+    """
+
+    def __init__(self, **options: Any) -> None:
+        """Make the bag and start listening.
+
+        Raises:
+            BagError: If the folder exists already.
+        """
+        super().__init__("recorder", **options)
+        fixed = ParameterDescriptor(read_only=True)
+        path = self.declare_parameter("path", "bag", fixed).value
+        episodes_per_file = self.declare_parameter("episodes_per_file", 32, fixed).value
+        self.counts: Counter[str] = Counter()
+        self._bag = BagWriter(Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file)
+        self._ticks: dict[int, dict[str, bytes]] = {}
+        self._last_ticks: set[int] = set()
+        self.written = 0
+        self._acknowledge = self.create_publisher(RECORDED.type, RECORDED.name, RECORDED.qos)
+        for topic in GRAPH_TOPICS.values():
+            self.create_subscription(
+                topic.type, topic.name, self._receiver(topic.name), live_qos(QUEUE_DEPTH), raw=True
+            )
+
+    def destroy_node(self) -> None:
+        """Write what is left and finish the bag."""
+        self._flush(before=None)
+        self._bag.close()
+        super().destroy_node()
+
+    def _receiver(self, name: str) -> Callable[[bytes], None]:
+        def receive(message: bytes) -> None:
+            stamp = raw_stamp(message)
+            if stamp > self.written:
+                self._ticks.setdefault(stamp, {}).setdefault(name, message)
+                if name == topics.EPISODE.name:
+                    self._note_end(stamp, message)
+                self._write_if_complete(stamp)
+            elif name == topics.EPISODE.name:
+                # The simulator offers a tick again that is in the bag: it has missed our word.
+                self._confirm(stamp)
+
+        return receive
+
+    def _note_end(self, stamp: int, message: bytes) -> None:
+        episode = deserialize_message(message, Episode)
+        if episode.terminated or episode.truncated:
+            self._last_ticks.add(stamp)
+
+    def _missing(self, stamp: int) -> list[str]:
+        expected = SIMULATOR_TOPICS if stamp in self._last_ticks else (*SIMULATOR_TOPICS, *MODULE_TOPICS)
+        return [topic.name for topic in expected if topic.name not in self._ticks[stamp]]
+
+    def _write_if_complete(self, stamp: int) -> None:
+        tick = self._ticks[stamp]
+        if len(tick) >= len(SIMULATOR_TOPICS) and not self._missing(stamp):
+            self._flush(before=stamp)
+            self._write(stamp)
+            self._confirm(stamp)
+        elif len(self._ticks) > HELD_TICKS:
+            self._write(min(self._ticks))
+
+    def _flush(self, before: int | None) -> None:
+        """Write unfinished ticks up to a stamp, or all."""
+        for stamp in sorted(self._ticks):
+            if before is None or stamp < before:
+                self._write(stamp)
+
+    def _write(self, stamp: int) -> None:
+        self.counts.update(f"{name} not recorded" for name in self._missing(stamp))
+        tick = self._ticks.pop(stamp)
+        for name in GRAPH_TOPICS:
+            if name in tick:
+                self._bag.write(name, stamp, tick[name])
+        self.written = stamp
+        if stamp in self._last_ticks:
+            self._last_ticks.remove(stamp)
+            self._bag.end_episode()
+
+    def _confirm(self, stamp: int) -> None:
+        self._acknowledge.publish(conversions.header(stamp))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(RecorderNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
