@@ -10,7 +10,7 @@ import math
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,33 +18,18 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_planner.lessons import LessonMaker, LessonProcess
-from mujoban_planner.planner import ARCHITECTURES, LearnedPlanner
-from mujoban_planner.play import Boards, play
 from mujoban_planner.samples import Batch, SampleBuffer, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
-from mujoban_rl.stats import wilson_interval
+from mujoban_planner.validation import NetworkConfig, solve_rates
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
 from mujoban_rl.weights import provenance, save_weights
-from mujoban_sim.generator import TEST_SEEDS, generate_batch
 from mujoban_sim.grid import AGENT, BOX, TARGET, WALL
 
 
 @dataclass(frozen=True)
-class ImitationConfig:
+class ImitationConfig(NetworkConfig):
     """What defines an imitation run."""
 
-    architecture: Literal["residual", "recurrent"] = "residual"
-    """Network."""
-    channels: int = 64
-    """Channels of the network."""
-    blocks: int = 8
-    """Residual blocks (residual)."""
-    depth: int = 3
-    """ConvLSTM layers (recurrent)."""
-    repeats: int = 3
-    """Repeats of the ConvLSTM layers (recurrent)."""
-    propagation: bool = True
-    """Further input planes: where the robot can walk and a box be pushed."""
     batch_size: int = 128
     learning_rate: float = 1e-3
     weight_decay: float = 1e-3
@@ -73,12 +58,6 @@ class ImitationConfig:
     buffer: int = 3_000_000
     """Samples kept of demonstrations, and as many of corrections."""
     seed: int = 0
-
-    def build(self) -> LearnedPlanner:
-        """Return a new network."""
-        recurrent = {"depth": self.depth, "repeats": self.repeats}
-        shape = {"blocks": self.blocks} if self.architecture == "residual" else recurrent
-        return ARCHITECTURES[self.architecture](channels=self.channels, propagation=self.propagation, **shape)
 
 
 def imitation_loss(planner: nn.Module, batch: Batch, config: ImitationConfig) -> tuple[Tensor, dict[str, Tensor]]:
@@ -148,14 +127,6 @@ def make_uncertain(state: Tensor, share: float, generator: torch.Generator) -> T
     return torch.cat([soft, state[n:]])
 
 
-def validation_boards(difficulty: int, n: int, first_seed: int = 9_000_000) -> Boards:
-    """Return held-out levels for the periodic evaluation."""
-    seeds = range(first_seed, first_seed + n)
-    assert seeds[0] in TEST_SEEDS and seeds[-1] in TEST_SEEDS
-    batch = generate_batch(difficulty, seeds)
-    return Boards(batch.wall, batch.target, batch.boxes, batch.player)
-
-
 class ImitationTrainer:
     """Trains a network on lessons; `run` does a bit of it, from the last checkpoint on."""
 
@@ -180,6 +151,8 @@ class ImitationTrainer:
         self.rng = np.random.default_rng(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.samples, self.steps, self.seconds, self.bits = 0, 0, 0.0, 0
+        self.metrics: dict[str, float] = {}
+        """Of the last evaluation."""
         self._restore()
         self.demonstrations = SampleBuffer(config.buffer)
         self.corrections = SampleBuffer(config.buffer)
@@ -219,9 +192,8 @@ class ImitationTrainer:
                     if self.steps % 10 == 0 and now - evaluated > evaluate_every:
                         evaluated = now
                         log.scalars(self.samples, self.evaluate(log))
-                metrics = self.evaluate(log)
-                log.scalars(self.samples, metrics)
-                self.save(metrics)
+                log.scalars(self.samples, self.evaluate(log))
+                self.save()
         finally:
             if self._process is not None:
                 self._process.close()
@@ -231,19 +203,15 @@ class ImitationTrainer:
         """Share of the schedule that is done."""
         return max(self.samples / self.config.horizon_samples, self.seconds / self.config.horizon_seconds)
 
-    def evaluate(self, log: TrainingLog | None = None, episodes: int = 256) -> dict[str, float]:
+    def evaluate(self, log: TrainingLog) -> dict[str, float]:
         """Return solve rates of the averaged weights on held-out levels."""
-        metrics = {"seconds": self.seconds}
-        for difficulty, n in ((5, episodes), (4, 64), (1, 64)):
-            game = play(self.average, validation_boards(difficulty, n), reduced_precision=self.device.type == "cpu")
-            metrics[f"solve_rate/{difficulty}"] = float(game.solved.mean())
-        if log is not None:
-            low, high = wilson_interval(round(metrics["solve_rate/5"] * episodes), episodes)
-            rates = "  ".join(f"{k} {v:.3f}" for k, v in metrics.items() if k != "seconds")
-            log.message(f"{self.samples:9d} samples {self.seconds:6.0f} s  {rates}  [{low:.3f}, {high:.3f}]")
-        return metrics
+        rates = solve_rates(self.average, reduced_precision=self.device.type == "cpu")
+        shown = "  ".join(f"{k} {v:.3f}" for k, v in rates.items())
+        log.message(f"{self.samples:9d} samples {self.seconds:6.0f} s  {shown}")
+        self.metrics = rates | {"seconds": self.seconds, "samples": float(self.samples)}
+        return self.metrics
 
-    def save(self, metrics: dict[str, float] | None = None) -> None:
+    def save(self) -> None:
         """Write a checkpoint and the averaged weights with their record."""
         counters = {"samples": self.samples, "seconds": self.seconds, "bits": self.bits}
         self.directory.save(
@@ -261,7 +229,7 @@ class ImitationTrainer:
             "steps": self.steps,
             "samples": self.samples,
             "seconds": round(self.seconds),
-            "metrics": metrics or {},
+            "metrics": self.metrics,
         }
         if math.isinf(self.config.horizon_seconds):
             record["training"]["horizon_seconds"] = None

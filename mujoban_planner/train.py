@@ -1,16 +1,17 @@
-"""Train the planner: `python -m mujoban_planner.train imitation --run runs/planner`."""
+"""Train the planner: `python -m mujoban_planner.train imitation` or `... mpo`."""
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 import torch
 import tyro
 
+from mujoban_planner import load
 from mujoban_planner.imitation import ImitationConfig, ImitationTrainer
+from mujoban_planner.reinforcement import MPOConfig, MPOTrainer
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Imitation:
     """Threads of the network on a CPU."""
     processes: int = 1
     """Processes that make lessons: 1, or 0 for a deterministic run."""
-    config: Annotated[ImitationConfig, tyro.conf.arg(name="")] = field(default_factory=ImitationConfig)
+    config: tyro.conf.OmitArgPrefixes[ImitationConfig] = field(default_factory=ImitationConfig)
 
     def main(self) -> None:
         """Train."""
@@ -47,9 +48,48 @@ class Imitation:
         )
 
 
+@dataclass(frozen=True)
+class MPO:
+    """Maximum a posteriori policy optimisation in the abstract environment (paper C.2)."""
+
+    run: Path = Path("runs/planner_mpo")
+    """Run directory; an existing one is resumed."""
+    init: Path | None = None
+    """Weights to start from, such as those of an imitation; none trains by MPO alone."""
+    bags: tuple[Path, ...] = ()
+    """Recorded bags whose transitions join the replay."""
+    device: str = "cpu"
+    """Device of network, environment and replay."""
+    seconds: float | None = None
+    """Stop after so many seconds; a later call resumes."""
+    updates: float = float("inf")
+    """Stop at so many updates; a later call resumes."""
+    evaluate_every: float = 300.0
+    """Seconds between evaluations on held-out levels."""
+    save_every: float = 120.0
+    """Seconds between checkpoints."""
+    threads: int = 1
+    """Threads of the network on a CPU."""
+    config: tyro.conf.OmitArgPrefixes[MPOConfig] = field(default_factory=MPOConfig)
+
+    def main(self) -> None:
+        """Train."""
+        torch.set_num_threads(self.threads)
+        init = load(self.init, self.device) if self.init is not None else None
+        trainer = MPOTrainer(
+            self.config, self.run, device=self.device, init=init, init_path=self.init, bags=self.bags
+        )
+        trainer.run(
+            seconds=self.seconds,
+            updates=self.updates,
+            evaluate_every=self.evaluate_every,
+            save_every=self.save_every,
+        )
+
+
 def main() -> None:
     """Run the command line."""
-    command = tyro.cli(Imitation)
+    command = tyro.extras.subcommand_cli_from_dict({"imitation": Imitation, "mpo": MPO})
     try:
         command.main()
     except ValueError as error:

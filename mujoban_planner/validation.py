@@ -1,0 +1,54 @@
+"""The network a trainer builds, and how it measures it: held-out levels, the same in every evaluation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from mujoban_planner.planner import ARCHITECTURES, LearnedPlanner
+from mujoban_planner.play import Boards, play
+from mujoban_sim.generator import TEST_SEEDS, generate_batch
+
+_FIRST_SEED: Final = 9_000_000
+_EPISODES: Final = {5: 256, 4: 64, 1: 64}
+"""Difficulty -> episodes of a periodic evaluation."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """What defines a planner network."""
+
+    architecture: Literal["residual", "recurrent"] = "residual"
+    """Network."""
+    channels: int = 64
+    """Channels of the network."""
+    blocks: int = 8
+    """Residual blocks (residual)."""
+    depth: int = 3
+    """ConvLSTM layers (recurrent)."""
+    repeats: int = 3
+    """Repeats of the ConvLSTM layers (recurrent)."""
+    propagation: bool = True
+    """Spread over the board by the rules where the robot can walk and boxes be pushed; the paper's network does not."""
+
+    def build(self) -> LearnedPlanner:
+        """Return a new network."""
+        recurrent = {"depth": self.depth, "repeats": self.repeats}
+        shape = {"blocks": self.blocks} if self.architecture == "residual" else recurrent
+        return ARCHITECTURES[self.architecture](channels=self.channels, propagation=self.propagation, **shape)
+
+
+def validation_boards(difficulty: int, n: int) -> Boards:
+    """Return `n` held-out levels."""
+    seeds = range(_FIRST_SEED, _FIRST_SEED + n)
+    assert seeds[0] in TEST_SEEDS and seeds[-1] in TEST_SEEDS
+    return Boards(*generate_batch(difficulty, seeds))
+
+
+def solve_rates(planner: LearnedPlanner, *, reduced_precision: bool) -> dict[str, float]:
+    """Return the share of held-out levels that a planner solves alone, by difficulty."""
+    rates = {}
+    for difficulty, n in _EPISODES.items():
+        game = play(planner, validation_boards(difficulty, n), reduced_precision=reduced_precision)
+        rates[f"solve_rate/{difficulty}"] = float(game.solved.mean())
+    return rates

@@ -1,0 +1,109 @@
+import pytest
+import torch
+
+from mujoban_rl.mpo_discrete import (
+    DiscreteMPO,
+    DiscreteMPOConfig,
+    expected_value,
+    improved_policy,
+    kl_divergence,
+    temperature_dual,
+)
+from mujoban_rl.replay import TimeMajorReplay, windowed_returns
+
+# A walk on 6 cells with 5 actions (left, right, stay, stay, stay): +1 at the right end. gamma = 0.9.
+STATES, ACTIONS, GAMMA = 6, 5, 0.9
+NEXT = torch.tensor([[max(s - 1, 0), s + 1, s, s, s] for s in range(STATES - 1)])
+REWARD = torch.where(NEXT == STATES - 1, 1.0, 0.0) - 0.01
+CONTINUES = (NEXT != STATES - 1).float()
+
+
+def _optimal_q():
+    q = torch.zeros(STATES - 1, ACTIONS)
+    for _ in range(300):
+        value = torch.cat([q.max(1).values, torch.zeros(1)])
+        q = REWARD + GAMMA * CONTINUES * value[NEXT]
+    return q
+
+
+def test_mpo_finds_the_known_optimal_policy_and_its_q_values():
+    torch.manual_seed(0)
+    logits, target = torch.zeros(STATES - 1, ACTIONS, requires_grad=True), torch.zeros(STATES - 1, ACTIONS)
+    q = torch.zeros(STATES - 1, ACTIONS)
+    mpo = DiscreteMPO(DiscreteMPOConfig(epsilon_policy=0.05))
+    adam = torch.optim.Adam([{"params": [logits], "lr": 0.1}, {"params": mpo.parameters(), "lr": 0.1}])
+    for step in range(800):
+        value = torch.cat([expected_value(q, target), torch.zeros(1)])
+        q = q + 0.3 * (REWARD + GAMMA * CONTINUES * value[NEXT] - q)
+        loss, stats = mpo(logits, target, q)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        if step % 5 == 0:
+            target = logits.detach().clone()
+    optimal = _optimal_q()
+    assert torch.equal(logits.argmax(1), optimal.argmax(1))
+    assert (torch.softmax(logits, 1)[:, 1] > 0.95).all()
+    assert torch.allclose(q[:, 1], optimal[:, 1], atol=0.03)
+    assert stats.kl_policy < 3.0
+
+
+def test_temperature_that_minimises_the_dual_puts_the_improved_policy_on_its_constraint():
+    generator = torch.Generator().manual_seed(0)
+    q = torch.randn(64, ACTIONS, generator=generator)
+    log_prior = torch.log_softmax(torch.randn(64, ACTIONS, generator=generator), 1)
+    mpo = DiscreteMPO()
+    adam = torch.optim.Adam([mpo.log_temperature], 0.1)
+    for _ in range(600):
+        loss = temperature_dual(q, log_prior, mpo.temperature, 0.1)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+    improved = improved_policy(q, log_prior, mpo.temperature.detach())
+    assert kl_divergence(improved.log(), log_prior).mean().item() == pytest.approx(0.1, rel=0.02)
+
+
+def test_improved_policy_is_the_closed_form():
+    q, log_prior = torch.tensor([[1.0, 2.0, 0.0]]), torch.tensor([[0.5, 0.25, 0.25]]).log()
+    weights = torch.tensor([0.5 * 2.718281828**0.5, 0.25 * 2.718281828**1.0, 0.25])
+    assert torch.allclose(improved_policy(q, log_prior, torch.tensor(2.0))[0], weights / weights.sum(), atol=1e-6)
+
+
+def test_only_the_online_policy_and_the_dual_variables_are_trained():
+    logits, target, q = (torch.randn(4, ACTIONS, requires_grad=True) for _ in range(3))
+    mpo = DiscreteMPO()
+    mpo(logits, target, q)[0].backward()
+    assert logits.grad is not None and target.grad is None and q.grad is None
+    assert mpo.log_temperature.grad is not None and mpo.log_alpha.grad is not None
+
+
+def test_contradictory_configuration_is_rejected():
+    with pytest.raises(ValueError, match="above 0"):
+        DiscreteMPOConfig(epsilon=0.0)
+
+
+def test_returns_stop_at_the_end_of_an_episode_and_at_dropped_steps():
+    reward = torch.tensor([[1.0, 2.0, 4.0]]).expand(4, 3)
+    terminated, dropped = torch.zeros(2, 4, 3, dtype=torch.bool)
+    terminated[1, 1] = True
+    dropped[2, 2] = True
+    dropped[3, 0] = True
+    returns = windowed_returns(reward, terminated, dropped, 0.5)
+    assert returns.reward.tolist() == [3.0, 2.0, 2.0, 0.0]
+    assert returns.bootstrap.tolist() == [0.125, 0.0, 0.25, 1.0]
+    assert returns.index.tolist()[::2] == [3, 2]
+    assert returns.valid.tolist() == [True, True, True, False]
+
+
+def test_replay_windows_are_successive_steps_of_one_environment():
+    replay = TimeMajorReplay(8, 3, {"value": ((), torch.int64)})
+    generator = torch.Generator().manual_seed(0)
+    with pytest.raises(ValueError, match="expected at least"):
+        replay.sample(1, 2, generator)
+    for step in range(20):
+        replay.add({"value": torch.arange(3) * 1000 + step})
+    window = replay.sample(200, 2, generator)["value"]
+    assert torch.equal(window[:, 1:], window[:, :-1] + 1)
+    assert set((window % 1000).flatten().tolist()) == set(range(12, 20))
+    with pytest.raises(ValueError, match="expected"):
+        replay.add({"other": torch.zeros(3)})
