@@ -1,0 +1,105 @@
+"""How long a step of state estimator and control termination takes, and how fast training data is read and used.
+
+``python -m benchmarks.estimator`` prints milliseconds and rates as JSON; with ``--bags`` also the rate at which frames
+are read from them. Times are processor time of one thread, so that other work on the machine hardly changes them.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from mujoban_estimator.bag_stream import ReadReport, find_bags, open_checked, stretches
+from mujoban_estimator.data import Batch
+from mujoban_estimator.estimator import StateEstimator
+from mujoban_estimator.learner import Learner, LearnerConfig
+from mujoban_estimator.termination import ControlTermination
+from mujoban_sim.bodies import BALL
+from mujoban_sim.interfaces import EstimatorInput, TerminationInput
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    repeats: int = 200
+    bags: tuple[Path, ...] = ()
+    """Bags, or folders of bags, to read."""
+    training_steps: int = 10
+
+
+def milliseconds(step: Callable[[], object], repeats: int) -> float:
+    """Return the median processor time of a step, in milliseconds."""
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        step()
+        times.append(time.process_time() - start)
+    return 1e3 * float(np.median(times))
+
+
+def step_times(repeats: int) -> dict[str, float]:
+    """Return the time of one step with batch 1; the estimator's is that of a step that takes in the frame."""
+    rng = np.random.default_rng(0)
+    frame = rng.integers(0, 256, (1, 64, 64, 3), dtype=np.uint8)
+    estimator, termination = StateEstimator(update_every=1).eval(), ControlTermination().eval()
+    seen = EstimatorInput(frame, np.zeros((1, 3), np.float32))
+    felt = TerminationInput(frame, np.zeros((1, BALL.proprio_size), np.float32), np.array([1]), np.array([False]))
+    belief, memory = estimator.initial_memory(1), termination.initial_memory(1)
+    return {
+        "estimator_step_ms": milliseconds(lambda: estimator.step(seen, belief), repeats),
+        "termination_step_ms": milliseconds(lambda: termination.probability(felt, memory), repeats),
+    }
+
+
+def training_rate(steps: int, streams: int = 4, ticks: int = 64) -> float:
+    """Return the ticks that training takes in per second, without reading them."""
+    rng = np.random.default_rng(0)
+    learner = Learner(LearnerConfig(), streams, rng)
+    state = np.zeros((streams, ticks, 10, 10, 4), np.float32)
+    state[..., 5, 5, 2] = 1.0
+    flags = np.zeros((streams, ticks), np.bool_)
+    views = np.ones((streams, ticks, 10, 10), np.bool_)
+    batch = Batch(
+        rng.integers(0, 256, (streams, ticks, 64, 64, 3), dtype=np.uint8),
+        rng.uniform(-3, 3, (streams, ticks, 3)).astype(np.float32),
+        np.zeros((streams, ticks, BALL.proprio_size), np.float32),
+        np.ones((streams, ticks), np.int64), np.arange(ticks) % 25 == flags, flags, state,
+        ~flags, flags[:, 0], views, views,
+    )  # fmt: skip
+
+    def step() -> None:
+        learner.loss(batch)[0].backward()
+
+    return 1e3 * streams * ticks / milliseconds(step, steps)
+
+
+def reading_rate(bags: tuple[Path, ...]) -> float:
+    """Return the frames read from bags, ready to train on, per second."""
+    report = ReadReport()
+    start = time.process_time()
+    for path in find_bags(bags):
+        for _ in stretches(open_checked(path), 64, report):
+            pass
+    return report.ticks / (time.process_time() - start)
+
+
+def main() -> None:
+    """Run the benchmark."""
+    options = tyro.cli(Options, description=__doc__)
+    torch.set_num_threads(1)
+    result = {**step_times(options.repeats), "training_ticks_per_s": training_rate(options.training_steps)}
+    if options.bags:
+        result["bag_frames_per_s"] = reading_rate(options.bags)
+    print(json.dumps({name: round(value, 3) for name, value in result.items()}, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,259 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from bringup.exploration import Disturbance
+from bringup.record import MixedEpisodes
+from bringup.recording import TOPICS as RECORDED
+from bringup.recording import Recorder
+from bringup.rollout import Tick
+from mujoban_estimator.bag_stream import ReadReport, endless, find_bags, open_checked, stretches
+from mujoban_estimator.data import Batcher, Stretch
+from mujoban_estimator.learner import Learner, LearnerConfig, choose_windows
+from mujoban_estimator.losses import missed_steps
+from mujoban_estimator.metrics import MapScores, TerminationScores
+from mujoban_estimator.termination import TerminationConfig
+from mujoban_estimator.train import TrainConfig, learning_rate
+from mujoban_msgs_py import topics
+from mujoban_msgs_py.bags import BagError, BagWriter
+from mujoban_sim.bodies import BALL
+from mujoban_sim.generator import TRAIN_SEEDS
+from mujoban_sim.grid import Instruction
+from mujoban_sim.interfaces import GroundTruth, Observation, TerminationOutput
+from mujoban_sim.sense_plan_act import Decision
+
+SEED = TRAIN_SEEDS.start
+LENGTHS = (7, 12)
+"""Ticks of the recorded episodes."""
+
+
+def made_up_ticks(episodes, lengths=LENGTHS):
+    """Ticks of one row whose frame, pose and so on tell which tick of which episode they are."""
+    for index, length in enumerate(lengths):
+        spec = episodes[index]
+        for step in range(length):
+            mark = 20 * index + step
+            state = spec.level.abstract_state()[None]
+            pose = np.array([[0.01 * mark, 0.5, 0.1]], np.float32)
+            boxes = np.zeros((1, 4, 2), np.float32)
+            issued = np.array([step % 4 == 0])
+            yield Tick(
+                np.array([0]), np.array([index]), np.array([step]),
+                Observation(
+                    np.full((1, 64, 64, 3), mark, np.uint8), np.full((1, BALL.proprio_size), mark, np.float32), pose
+                ),
+                GroundTruth(state, pose, np.zeros((1, 3), np.float32), boxes, np.array([step % 4 == 3])),
+                Decision(
+                    state, TerminationOutput(np.array([0.25], np.float32), issued & (step > 0), np.array([False])),
+                    np.array([1 + step // 4]), np.array([1 + step // 4]), issued, np.zeros((1, 2), np.float32),
+                ),
+                np.zeros(1, np.float32), np.zeros(1, np.float32),
+                np.array([False]), np.array([step == length - 1]),
+            )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bags")
+    episodes = MixedEpisodes(len(LENGTHS), SEED, [1])
+    with Recorder(path, BALL, episodes, [1, 1]) as recorder:
+        for tick in made_up_ticks(episodes):
+            recorder.write(tick)
+    return path
+
+
+def test_a_bag_gives_back_the_episodes_in_stretches(bags):
+    report = ReadReport()
+    found = list(stretches(open_checked(find_bags([bags])[0]), 8, report))
+    assert [len(s.frame) for s in found] == [7, 8, 4]
+    assert [s.first for s in found] == [True, True, False]
+    assert [int(m) for s in found for m in s.frame[:, 0, 0, 0]] == [*range(7), *range(20, 32)]
+    assert report.ticks == 19 and report.episodes == 2 and not report.skipped
+
+
+def test_instruction_and_termination_are_those_of_the_tick_before(bags):
+    first = next(stretches(open_checked(find_bags([bags])[0]), 8, ReadReport()))
+    assert first.instruction.tolist() == [Instruction.STAY, 1, 1, 1, 1, 2, 2]
+    assert np.flatnonzero(first.terminated).tolist() == [5]
+    assert np.flatnonzero(first.completed).tolist() == [3]
+
+
+def test_recorded_bags_hold_every_topic_of_the_graph(bags):
+    bag = open_checked(find_bags([bags])[0])
+    assert set(bag.topics) == {t.name for t in RECORDED}
+    assert set(topics.GRAPH_TOPICS) - set(bag.topics) == {topics.TOP_CAMERA.name}
+    assert bag.topics[topics.EPISODE.name].count == sum(LENGTHS) + len(LENGTHS)
+
+
+def copy_without(bag, path, drop):
+    """Copy the messages of a bag for which `drop(topic, stamp)` is false."""
+    names = [t for t in RECORDED if not drop(t.name, None)]
+    with BagWriter(path, names) as writer:
+        for message in bag.messages():
+            if not drop(message.topic, None) and not drop(message.topic, message.stamp):
+                writer.write(message.topic, message.stamp, message.data)
+
+
+def test_a_missing_topic_is_named(bags, tmp_path):
+    bag = open_checked(find_bags([bags])[0])
+    copy_without(bag, tmp_path / "bag", lambda topic, _: topic == topics.TRUE_TERMINATION.name)
+    with pytest.raises(BagError, match=topics.TRUE_TERMINATION.name):
+        open_checked(tmp_path / "bag")
+
+
+def test_behind_a_missing_tick_an_episode_is_not_used(bags, tmp_path):
+    bag = open_checked(find_bags([bags])[0])
+    gone = 3 * topics.TICK
+    copy_without(bag, tmp_path / "bag", lambda topic, stamp: topic == topics.CAMERA.name and stamp == gone)
+    report = ReadReport()
+    found = list(stretches(open_checked(tmp_path / "bag"), 64, report))
+    assert [len(s.frame) for s in found] == [2, 12]
+    assert sum(report.skipped.values()) == 4
+
+
+def test_a_bag_that_begins_amid_an_episode_is_used_from_the_next_start(bags, tmp_path):
+    bag = open_checked(find_bags([bags])[0])
+    copy_without(bag, tmp_path / "bag", lambda _, stamp: stamp is not None and stamp <= 2 * topics.TICK)
+    found = list(stretches(open_checked(tmp_path / "bag"), 64, ReadReport()))
+    assert [len(s.frame) for s in found] == [12]
+
+
+def test_paths_without_bags_are_named(tmp_path):
+    with pytest.raises(BagError, match="nowhere"):
+        find_bags([tmp_path / "nowhere"])
+    with pytest.raises(BagError, match="no bag in"):
+        find_bags([tmp_path])
+
+
+def test_episodes_kept_for_tests_are_refused(tmp_path):
+    episodes = MixedEpisodes(1, 1000, [1])
+    with Recorder(tmp_path, BALL, episodes, [1]) as recorder:
+        for tick in made_up_ticks(episodes, (5,)):
+            recorder.write(tick)
+    paths = find_bags([tmp_path])
+    with pytest.raises(BagError, match="seed 1000"):
+        next(endless(paths, 8, np.random.default_rng(0), ReadReport()))
+    assert next(endless(paths, 8, np.random.default_rng(0), ReadReport(), allow_test_seeds=True)).first
+
+
+def stretch(ticks, *, first=True, terminated=(), completed=()):
+    rng = np.random.default_rng(ticks)
+    state = MixedEpisodes(1, SEED, [1])[0].level.abstract_state()
+    flags = np.arange(ticks)
+    return Stretch(
+        rng.integers(0, 256, (ticks, 64, 64, 3), dtype=np.uint8),
+        np.tile(np.float32([-0.5, 0.5, 0.0]), (ticks, 1)),
+        np.zeros((ticks, BALL.proprio_size), np.float32),
+        np.ones(ticks, np.int64),
+        np.isin(flags, terminated),
+        np.isin(flags, completed),
+        np.repeat(state[None], ticks, 0),
+        first,
+    )
+
+
+def test_windows_are_whole_instructions_from_their_issue():
+    stream = iter([stretch(20, terminated=(6, 10))])
+    batch = next(Batcher([stream], 24, BALL))
+    windows = choose_windows(batch, 10_000, 64, np.random.default_rng(0))
+    found = sorted(w[v].tolist() for w, v in zip(windows.tick, windows.valid, strict=True))
+    assert found == [list(range(6)), list(range(6, 10)), list(range(10, 20))]
+
+
+def test_windows_do_not_begin_where_the_issue_is_unknown():
+    stream = iter([stretch(20, first=False, terminated=(6,))])
+    batch = next(Batcher([stream], 20, BALL))
+    windows = choose_windows(batch, 10_000, 5, np.random.default_rng(0))
+    assert windows.tick[windows.valid].tolist() == [6, 7, 8, 9, 10]
+
+
+def test_a_stream_that_ends_early_is_padding():
+    batches = list(Batcher([iter([stretch(4)]), iter([stretch(8), stretch(3, first=False)])], 8, BALL))
+    assert [b.valid.sum(1).tolist() for b in batches] == [[4, 8], [0, 3]]
+    assert not batches[1].first[0]
+
+
+def test_cells_stay_seen_until_the_next_episode():
+    away = stretch(4)._replace(pose=np.tile(np.float32([-0.5, 0.5, np.pi]), (4, 1)), first=False)
+    batcher = Batcher([iter([stretch(4), away, away._replace(first=True)])], 4, BALL)
+    first, second, third = batcher
+    assert (second.seen[:, -1] & first.in_view[:, 0]).sum() == first.in_view[:, 0].sum()
+    assert not (third.seen[:, -1] & first.in_view[:, 0]).all() and third.seen.sum() < second.seen.sum()
+
+
+def test_missed_steps_count_earlier_negatives_under_a_positive_label():
+    completed = torch.tensor([[False, True, True, True, True]])
+    logits = torch.tensor([[-1.0, -1.0, -1.0, 1.0, -1.0]])
+    assert missed_steps(logits, completed).tolist() == [[0.0, 0.0, 1.0, 2.0, 2.0]]
+
+
+def test_a_learner_fits_what_it_sees_again_and_again():
+    torch.manual_seed(0)
+    learner = Learner(LearnerConfig(window_frames=16), 1, np.random.default_rng(0))
+    optimiser = torch.optim.Adam(learner.parameters(), 3e-3)
+    batch = next(Batcher([iter([stretch(16, terminated=(8,), completed=(7, 14, 15))])], 16, BALL))
+    losses = []
+    for _ in range(30):
+        optimiser.zero_grad()
+        loss, _ = learner.loss(batch)
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.6 * losses[0]
+
+
+def test_estimator_and_termination_must_share_the_resnet():
+    with pytest.raises(ValueError, match="channels"):
+        LearnerConfig(termination=TerminationConfig(channels=8))
+    learner = Learner(LearnerConfig(), 1, np.random.default_rng(0))
+    assert learner.estimator.encoder is learner.termination.encoder
+
+
+def test_the_learning_rate_warms_up_and_falls():
+    config = TrainConfig(steps=1000, warm_up=10, learning_rate=1.0, final_rate=0.1)
+    assert learning_rate(0, config) == pytest.approx(0.1) and learning_rate(500, config) == pytest.approx(0.5)
+    assert learning_rate(5000, config) == pytest.approx(0.1)
+
+
+def test_map_scores_tell_apart_what_was_seen():
+    truth = MixedEpisodes(1, SEED, [5])[0].level.abstract_state()[None]
+    blind = truth.copy()
+    row, col = np.argwhere(truth[0, ..., 3])[0]
+    blind[0, row, col, 3] = 0.0
+    seen = np.ones((1, 10, 10), bool)
+    seen[0, row, col] = False
+    scores = MapScores()
+    scores.add(blind, truth, np.zeros_like(seen), seen)
+    report = scores.report()
+    assert report["box_recall_seen_before"] == 1.0 and report["box_recall_never_seen"] == 0.0
+    assert report["boxes_all_right"] == 0.0 and report["wall_accuracy_seen"] == report["agent_accuracy"] == 1.0
+    assert report["wall_calibration_error"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("detection", "precision", "recall", "delay"), [(5, 1.0, 1.0, 1.0), (3, 0.0, None, None), (None, None, 0.0, None)]
+)
+def test_termination_scores_count_instructions(detection, precision, recall, delay):
+    probability, completed = np.zeros(10, np.float32), np.arange(10) >= 4
+    if detection is not None:
+        probability[detection] = 0.9
+    scores = TerminationScores()
+    scores.add(probability, completed, 0.5)
+    report = scores.report()
+    for name, value in (("precision", precision), ("recall", recall), ("mean_delay", delay)):
+        found = report[f"termination_{name}"]
+        assert found == value or (value is None and np.isnan(found))
+
+
+def test_disturbances_must_be_probabilities():
+    with pytest.raises(ValueError, match="delay is 2"):
+        Disturbance(delay=2)
+
+
+def test_the_command_names_a_bad_bag_in_one_line(tmp_path):
+    command = [sys.executable, "-m", "mujoban_estimator.train", "--bags", str(tmp_path), "--run", str(tmp_path / "run")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "no bag in" in done.stderr
