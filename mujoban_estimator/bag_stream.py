@@ -103,7 +103,7 @@ class _Episode:
     def take(self) -> Stretch:
         """Return what has been gathered and forget it."""
         columns = [np.stack(c) if isinstance(c[0], np.ndarray) else np.array(c) for c in zip(*self.rows, strict=True)]
-        stretch = Stretch(*columns, self.first)  # pyright: ignore[reportArgumentType]
+        stretch = Stretch._make([*columns, self.first])
         self.rows, self.first = [], False
         return stretch
 

@@ -89,7 +89,7 @@ class Batcher:
         self._seen[first] = False
         seen = np.logical_or.accumulate(in_view, axis=1) | self._seen[:, None]
         self._seen = seen[:, -1].copy()
-        return Batch(*padded, valid, first, in_view, seen)
+        return Batch._make([*padded, valid, first, in_view, seen])
 
     def _look(self, abstract_state: NDArray[np.float32], pose: NDArray[np.float32]) -> NDArray[np.bool_]:
         wall = abstract_state[..., WALL].reshape(-1, GRID_SIZE, GRID_SIZE) > 0.5

@@ -74,6 +74,9 @@ class GeometricAttention(nn.Module):
     with the width of a pixel and is learned; without it attention takes ten times as long to find the cells.
     """
 
+    centres: Tensor
+    """Centres of rows and columns in the frame, [16]."""
+
     def __init__(self, hidden: int = 32) -> None:
         super().__init__()
         self.learned = nn.Sequential(
@@ -223,7 +226,7 @@ class StateEstimator(nn.Module, Estimator):
         hidden, belief = self.memory(cells.unflatten(0, (b, t)), belief)
         logits = self.classify(torch.cat([hidden.flatten(0, 1).to(cells.dtype), cells], dim=1))
         outputs = (x.float().permute(0, 2, 3, 1).unflatten(0, (b, t)) for x in (logits, self.classify_frame(cells)))
-        return Estimates(*outputs, belief)
+        return Estimates._make([*outputs, belief])
 
     def initial_memory(self, batch: int) -> Memory:
         """Return the memory of `batch` robots at the start of an episode."""

@@ -159,7 +159,10 @@ class Trainer:
         """Train until the steps are done, the time is up or a signal asks to stop; then save."""
         options, config = self.options, self.options.config
         loader = DataLoader(
-            BagBatches(options, self.bags, self.step), batch_size=None, num_workers=options.workers, collate_fn=_as_is
+            BagBatches(options, self.bags, self.step),
+            batch_size=None,
+            num_workers=options.workers,
+            collate_fn=_as_is,  # pyright: ignore[reportArgumentType] - one batch at a time, not a list
         )
         totals: dict[str, list[float]] = {}
         with (
