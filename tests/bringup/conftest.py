@@ -1,0 +1,144 @@
+"""A graph to play with: all nodes on one executor, and a tap that notes what the modules say."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+from mujoban_msgs.msg import Episode, Instruction
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from bringup.command import Choice, Stack
+from bringup.graph import NODES, InProcess
+from bringup.monitor import MonitorNode
+from bringup.parameters import graph_parameters
+from mujoban_msgs_py import topics
+from mujoban_msgs_py.conversions import stamp_of, torque_from_msg
+from mujoban_msgs_py.tick_node import live_qos
+from mujoban_sim.episodes import Episodes
+from mujoban_sim.plugins import ROLES
+
+ORACLES = Stack({role: Choice(role, "oracle") for role in ROLES})
+
+
+@dataclass
+class Said:
+    """What was said, by stamp."""
+
+    instruction: dict[int, tuple[int, int]] = field(default_factory=dict)
+    torque: dict[int, list[float]] = field(default_factory=dict)
+    reward: dict[int, float] = field(default_factory=dict)
+    episodes: dict[int, Episode] = field(default_factory=dict)
+
+
+class Tap(Node):
+    """Notes instructions, torques and rewards."""
+
+    def __init__(self):
+        super().__init__("tap")
+        self.said = Said()
+        self.create_subscription(Episode, topics.EPISODE.name, self._episode, live_qos(1000))
+        self.create_subscription(Instruction, topics.INSTRUCTION.name, self._instruction, live_qos(1000))
+        self.create_subscription(JointState, topics.TORQUE.name, self._torque, live_qos(1000))
+
+    def _episode(self, message):
+        self.said.episodes[stamp_of(message)] = message
+        self.said.reward[stamp_of(message)] = message.reward
+
+    def _instruction(self, message):
+        self.said.instruction[stamp_of(message)] = (message.sequence, message.direction)
+
+    def _torque(self, message):
+        self.said.torque[stamp_of(message)] = torque_from_msg(message).tolist()
+
+
+class Play:
+    """A running graph."""
+
+    def __init__(self, stack: Stack, episodes: Episodes, names=NODES, **simulator):
+        simulator.setdefault("resend_after", 0.2)
+        self.parameters = graph_parameters(stack, episodes, **simulator)
+        self.graph = InProcess(self.parameters, ())
+        self._open = True
+        self.tap = self.graph.add(Tap())
+        self.monitor = self.graph.add(MonitorNode(len(episodes)))
+        for name in names:
+            self.graph.start(name)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        if self._open:
+            self._open = False
+            self.graph.__exit__(*exception)
+
+    @property
+    def said(self) -> Said:
+        return self.tap.said
+
+    @property
+    def simulator(self):
+        return self.graph.nodes["simulator"]
+
+    def spin_until(self, condition: Callable[[], object], timeout: float = 60.0):
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline, "the graph stands still"
+            self.graph.executor.spin_once(timeout_sec=0.05)
+
+    def finish(self):
+        self.spin_until(self.monitor.finished.done)
+        return self.monitor.results
+
+    def call(self, service_type, name: str, request):
+        client = self.tap.create_client(service_type, name)
+        self.spin_until(client.service_is_ready)
+        future = client.call_async(request)
+        self.spin_until(future.done)
+        self.tap.destroy_client(client)
+        return future.result()
+
+
+@pytest.fixture
+def play(ros):
+    """Return a function that starts a graph; it is stopped after the test."""
+    running = []
+
+    def start(stack=ORACLES, episodes=None, **options):
+        running.append(Play(stack, episodes or Episodes(1, 0, difficulty=2), **options))
+        return running[-1]
+
+    yield start
+    for graph in running:
+        graph.__exit__(None, None, None)
+
+
+@pytest.fixture(scope="session")
+def fresh_weights(tmp_path_factory):
+    """Return a stack of untrained networks, saved as weights."""
+    import torch
+
+    from mujoban_controller.controller import VisuomotorController
+    from mujoban_estimator.estimator import StateEstimator
+    from mujoban_estimator.termination import ControlTermination
+    from mujoban_rl.weights import save_weights
+
+    folder = tmp_path_factory.mktemp("weights")
+    torch.manual_seed(0)
+    modules = {"estimator": StateEstimator, "termination": ControlTermination, "controller": VisuomotorController}
+    choices = {"planner": Choice("planner", "oracle")}
+    for role, kind in modules.items():
+        path = folder / f"{role}.safetensors"
+        save_weights(path, kind(), {}, {})
+        choices[role] = Choice(role, weights=path)
+    return Stack({role: choices[role] for role in ROLES})
+
+
+@pytest.fixture(scope="session")
+def oracles():
+    """Return the stack of oracles."""
+    return ORACLES

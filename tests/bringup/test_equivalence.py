@@ -1,0 +1,71 @@
+"""The lockstep graph and the rollout in process are one policy: same instructions, torques and rewards, exactly."""
+
+import numpy as np
+import pytest
+import torch
+
+from bringup.command import Choice, Stack
+from bringup.rollout import ticks
+from mujoban_msgs_py.topics import TICK
+from mujoban_sim.episodes import Episodes
+from mujoban_sim.world import World
+
+
+def rolled_out(stack, episodes, time_limit):
+    """Return per tick (sequence, direction), torque and reward of the rollout with batch 1."""
+    torch.set_num_threads(1)
+    world = World(1, max_boxes=episodes.max_boxes, time_limit=time_limit)
+    return [
+        (
+            (int(t.decision.sequence[0]), int(t.decision.instruction[0])),
+            t.decision.torque[0].tolist(),
+            float(t.reward[0]),
+            bool(t.solved[0] | t.truncated[0]),
+        )
+        for t in ticks(stack.policy(), world, episodes)
+    ]
+
+
+def assert_equal_runs(play, stack, episodes, time_limit):
+    expected = rolled_out(stack, episodes, time_limit)
+    graph = play(stack, episodes, time_limit=time_limit)
+    graph.finish()
+    said, stamp = graph.said, 0
+    for instruction, torque, reward, ended in expected:
+        stamp += TICK
+        assert said.instruction[stamp] == instruction
+        assert said.torque[stamp] == torque
+        assert said.reward[stamp + TICK] == reward
+        stamp += TICK * ended  # an episode's last observation is a tick of its own
+    assert len(said.torque) == len(expected)
+
+
+def test_oracles_do_the_same_in_the_graph_as_in_process(play, oracles):
+    assert_equal_runs(play, oracles, Episodes(2, 3, difficulty=2), 400)
+
+
+def test_networks_do_the_same_in_the_graph_as_in_process(play, fresh_weights):
+    assert_equal_runs(play, fresh_weights, Episodes(2, 5, difficulty=3), 40)
+
+
+@pytest.mark.parametrize("role", ["estimator", "termination", "controller"])
+def test_one_network_among_oracles_does_the_same(play, oracles, fresh_weights, role):
+    stack = Stack(oracles.choices | {role: fresh_weights.choices[role]})
+    assert_equal_runs(play, stack, Episodes(1, 7, difficulty=1), 25)
+
+
+def test_two_runs_of_the_graph_are_equal(play, fresh_weights):
+    runs = []
+    for _ in range(2):
+        graph = play(fresh_weights, Episodes(1, 9, difficulty=2), time_limit=20)
+        graph.finish()
+        runs.append((graph.said.instruction, graph.said.torque, graph.said.reward))
+        graph.__exit__(None, None, None)
+    assert runs[0] == runs[1]
+    assert np.isfinite([t for torque in runs[0][1].values() for t in torque]).all()
+
+
+def test_a_class_of_ones_own_plays_a_role(play, oracles):
+    stack = Stack(oracles.choices | {"planner": Choice("planner", "mujoban_sim.oracles:OraclePlanner")})
+    (result,) = play(stack, Episodes(1, 0, difficulty=1)).finish()
+    assert result.solved
