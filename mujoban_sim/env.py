@@ -255,4 +255,4 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
         self.world.close()
 
     def _observe(self) -> Observations:
-        return {name: _READERS[name](self.world)[0] for name in self._names}
+        return {name: values[0] for name, values in observe(self.world, self._names).items()}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
 import numpy as np
@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from mujoban_sim.bodies import FIRST_PERSON_CAMERA, get_body
 from mujoban_sim.camera import FRAME_SIZE
 from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
-from mujoban_sim.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, cell_to_xy, xy_to_cell
+from mujoban_sim.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET, WALL, cell_to_xy, xy_to_cell
 from mujoban_sim.interfaces import GroundTruth, Observation
 from mujoban_sim.scene import BOX_COORDINATES, SUBSTEPS, SceneCache, settled_positions
-from mujoban_sim.world_kernels import apply_torque, fill_abstract_state, update
+from mujoban_sim.world_kernels import apply_torque, update
 
 if TYPE_CHECKING:
     from mujoban_sim.levels import Level
@@ -143,6 +143,7 @@ class World:
         self._target_cell = np.full((b, k, 2), -1, np.int64)
         self.box_on_target = np.zeros((b, k), np.bool_)
         self.boxes_on_target = np.zeros(b, np.int64)
+        self._abstract_state = np.zeros((b, n, n, len(CHANNELS)), np.float32)
         self.reward = np.zeros(b, np.float32)
         self.episode_return = np.zeros(b, np.float32)
         self.steps = np.zeros(b, np.int64)
@@ -160,9 +161,21 @@ class World:
         self._ctrl = self._physics.bind("ctrl")
         self._sensors = self._physics.bind("sensordata")
         self._root = BOX_COORDINATES * self.max_boxes
-        self._joint_qpos = np.array(self.body.joint_qpos, np.int64)
-        self._joint_qvel = np.array(self.body.joint_qvel, np.int64)
         self._rest_qpos = settled_positions(empty, self.max_boxes, self.body)
+        self._derived = self._kernel_arguments()
+
+    def _kernel_arguments(self) -> tuple[Any, ...]:
+        """Return what `update` takes after its rows; gathered once, since that would take as long as the kernel."""
+        goals, body = self.goals, self.body
+        return (
+            self._qpos, self._qvel, self._sensors, self._root, body.root == "free",
+            np.array(body.joint_qpos, np.int64), np.array(body.joint_qvel, np.int64), body.cell_size, self.time_limit,
+            self.box_count, self.target, goals.kind, goals.robot_target, goals.box_index, goals.box_target,
+            goals.tolerance, goals.max_box_speed, goals.reached, self.pose, self.velocity, self.proprio,
+            self.box_position, self.box_speed, self.agent_cell, self.box_cell, self.box_on_target,
+            self.boxes_on_target, self._abstract_state, self.reward, self.episode_return, self.steps, self.solved,
+            self.truncated,
+        )  # fmt: skip
 
     @property
     def completed(self) -> NDArray[np.bool_]:
@@ -209,6 +222,8 @@ class World:
             self._episodes[row] = episode
             self._models[row] = model
             self.wall[row], self.target[row] = level.wall, level.target
+            self._abstract_state[row] = 0.0
+            self._abstract_state[row, ..., WALL], self._abstract_state[row, ..., TARGET] = level.wall, level.target
             self.box_count[row] = len(level.boxes)
             self._target_cell[row] = -1
             self._target_cell[row, : len(level.boxes)] = np.argwhere(level.target)
@@ -263,7 +278,7 @@ class World:
             q[:root].reshape(-1, BOX_COORDINATES)[:count, :2] = boxes[m, :count]
             body.set_pose(q[root:], pose[m])
         self._physics.forward(ids=rows)
-        self._update(rows, advance=False)
+        update(rows, False, *self._derived)
 
     def instruct(self, instruction: NDArray[np.int64], issued: NDArray[np.bool_]) -> None:
         """Tell which instructions A_t the coming steps follow.
@@ -302,26 +317,12 @@ class World:
         else:
             self.reward[:] = 0.0
             self._physics.step(ids=live, nstep=SUBSTEPS, stage=_STAGE_VELOCITY)
-        if self._update(live, advance=True):
+        if update(live, True, *self._derived):
             self._live = np.flatnonzero(~self.done)
 
-    def _update(self, rows: NDArray[np.int64], advance: bool) -> bool:
-        """Derive everything from physics; return whether an episode has ended in one of the rows."""
-        goals, body = self.goals, self.body
-        return update(
-            rows, advance, self._qpos, self._qvel, self._sensors, self._root, body.root == "free",
-            self._joint_qpos, self._joint_qvel, body.cell_size, self.time_limit, self.box_count, self.target,
-            goals.kind, goals.robot_target, goals.box_index, goals.box_target, goals.tolerance, goals.max_box_speed,
-            goals.reached, self.pose, self.velocity, self.proprio, self.box_position, self.box_speed,
-            self.agent_cell, self.box_cell, self.box_on_target, self.boxes_on_target, self.reward, self.episode_return,
-            self.steps, self.solved, self.truncated,
-        )  # fmt: skip
-
     def abstract_state(self) -> NDArray[np.float32]:
-        """Return s_abst, binary, [B, N, N, 4]."""
-        state = np.empty((self.batch, GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32)
-        fill_abstract_state(self.wall, self.target, self.agent_cell, self.box_cell, state)
-        return state
+        """Return a copy of s_abst, binary, [B, N, N, 4]."""
+        return self._abstract_state.copy()
 
     def truth(self) -> GroundTruth:
         """Return a copy of what only the simulator knows."""

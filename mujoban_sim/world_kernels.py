@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mujoban_sim.bodies import INERTIAL_SIZE, UP_AXIS_SIZE
 from mujoban_sim.goals import is_completed
-from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
+from mujoban_sim.grid import AGENT, BOX, GRID_SIZE
 from mujoban_sim.rules import BOX_REWARD, SOLVED_REWARD
 from mujoban_sim.scene import BOX_COORDINATES
 
@@ -114,6 +114,17 @@ def _locate_agent(
 
 
 @njit(cache=True, nogil=True)
+def _mark(
+    abstract_state: NDArray[np.float32], agent_cell: NDArray[np.int64], box_cell: NDArray[np.int64], value: float
+) -> None:
+    """Write a value at the agent's cell [2] and the boxes' cells [K, 2] of an abstract state, [N, N, 4]."""
+    abstract_state[agent_cell[0], agent_cell[1], AGENT] = value
+    for k in range(box_cell.shape[0]):
+        if box_cell[k, 0] >= 0:
+            abstract_state[box_cell[k, 0], box_cell[k, 1], BOX] = value
+
+
+@njit(cache=True, nogil=True)
 def update(
     rows: NDArray[np.int64],
     advance: bool,
@@ -144,6 +155,7 @@ def update(
     box_cell: NDArray[np.int64],
     box_on_target: NDArray[np.bool_],
     boxes_on_target: NDArray[np.int64],
+    abstract_state: NDArray[np.float32],
     reward: NDArray[np.float32],
     episode_return: NDArray[np.float32],
     steps: NDArray[np.int64],
@@ -163,12 +175,14 @@ def update(
             qpos[b, root:], qvel[b, root:], sensors[b], free_root, joint_qpos, joint_qvel,
             pose[b], velocity[b], proprio[b],
         )  # fmt: skip
+        _mark(abstract_state[b], agent_cell[b], box_cell[b], 0.0)
         before = boxes_on_target[b]
         boxes_on_target[b] = _observe_boxes(
             qpos[b], qvel[b], cell_size, int(box_count[b]), target[b],
             box_position[b], box_speed[b], box_cell[b], box_on_target[b],
         )  # fmt: skip
         _locate_agent(qpos[b, root], qpos[b, root + 1], cell_size, box_cell[b], agent_cell[b])
+        _mark(abstract_state[b], agent_cell[b], box_cell[b], 1.0)
         k = BOX_COORDINATES * box_index[b]
         robot_offset = (qpos[b, root] - robot_target[b, 0], qpos[b, root + 1] - robot_target[b, 1])
         box_offset = (qpos[b, k] - box_target[b, 0], qpos[b, k + 1] - box_target[b, 1])
@@ -194,24 +208,3 @@ def apply_torque(torque: NDArray[np.floating], control: NDArray[np.float64]) -> 
                 return False
     control[:] = torque
     return True
-
-
-@njit(cache=True, nogil=True)
-def fill_abstract_state(
-    wall: NDArray[np.bool_],
-    target: NDArray[np.bool_],
-    agent_cell: NDArray[np.int64],
-    box_cell: NDArray[np.int64],
-    state: NDArray[np.float32],
-) -> None:
-    """Fill s_abst, [B, N, N, 4], from walls and targets [B, N, N], agent cell [B, 2] and box cells [B, K, 2]."""
-    state[:] = 0.0
-    for b in range(wall.shape[0]):
-        for row in range(wall.shape[1]):
-            for col in range(wall.shape[2]):
-                state[b, row, col, WALL] = wall[b, row, col]
-                state[b, row, col, TARGET] = target[b, row, col]
-        state[b, agent_cell[b, 0], agent_cell[b, 1], AGENT] = 1.0
-        for k in range(box_cell.shape[1]):
-            if box_cell[b, k, 0] >= 0:
-                state[b, box_cell[b, k, 0], box_cell[b, k, 1], BOX] = 1.0
