@@ -15,12 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mujoban_planner.teacher import STEP_REWARD
 from mujoban_sim.grid import GRID_SIZE, OFFSETS_RC, Instruction
 from mujoban_sim.levels import Level
 from mujoban_sim.rules import BOX_REWARD, SOLVED_REWARD
 
-STEP_REWARD: Final = -0.01
-"""Reward of every planner step (paper C.2)."""
 MOVE_LIMIT: Final = 120
 """Instructions of an abstract episode."""
 _CELLS: Final = GRID_SIZE * GRID_SIZE

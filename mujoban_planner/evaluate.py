@@ -15,15 +15,19 @@ import tyro
 
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import MOVE_LIMIT
+from mujoban_planner.boards import take_levels
 from mujoban_planner.lookahead import LookAheadPlanner
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_planner.play import Boards, play
+from mujoban_planner.play import play
 from mujoban_rl.stats import wilson_interval
 from mujoban_rl.weights import digest
 from mujoban_sim.generator import TEST_SEEDS, generate_batch
 from mujoban_sim.grid import DIFFICULTIES
 from mujoban_sim.levels import LevelBatch, read_levels, stack_levels
 from mujoban_sim.solver import Status, solve_batch
+
+_CHUNK = 1024
+"""Levels played at once."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Options:
     json: Path | None = None
     """Where the figures are written."""
 
-    def boards(self) -> Boards:
+    def level_batch(self) -> LevelBatch:
         """Return the levels.
 
         Raises:
@@ -63,22 +67,23 @@ class Options:
         """
         if self.levels is not None:
             levels = read_levels(self.levels)
-            return _boards(stack_levels(levels[: self.episodes or None]))
+            return stack_levels(levels[: self.episodes or None])
         if self.difficulty not in DIFFICULTIES:
             raise ValueError(f"difficulty {self.difficulty}: expected one of {', '.join(map(str, DIFFICULTIES))}")
         seeds = range(self.seed, self.seed + self.episodes)
         if self.episodes < 1 or seeds[0] not in TEST_SEEDS or seeds[-1] not in TEST_SEEDS:
             raise ValueError(f"{self.episodes} episodes from seed {self.seed}: expected at least one, seeds below 10^7")
-        return _boards(generate_batch(self.difficulty, seeds))
+        return generate_batch(self.difficulty, seeds)
 
 
-def evaluate(planner: LearnedPlanner, boards: Boards, options: Options) -> dict[str, Any]:
+def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> dict[str, Any]:
     """Return the figures of a planner on levels."""
     planner.thinking = options.thinking
     player = LookAheadPlanner(planner, options.expansions) if options.look_ahead else planner
     start = time.perf_counter()
     # In chunks, so that memory stays small whatever the number of levels.
-    games = [play(player, boards.take(rows)) for rows in np.array_split(np.arange(len(boards.player)), _chunks(boards))]
+    parts = np.array_split(np.arange(len(levels.player)), -(-len(levels.player) // _CHUNK))
+    games = [play(player, take_levels(levels, rows)) for rows in parts]
     elapsed = time.perf_counter() - start
     moves = np.concatenate([game.moves for game in games])
     solved = moves >= 0
@@ -103,18 +108,10 @@ def evaluate(planner: LearnedPlanner, boards: Boards, options: Options) -> dict[
         result["expansions"] = options.expansions
         result["evaluations_per_level"] = player.evaluations / len(moves)
     if options.optimal and solved.any():
-        solutions = solve_batch(LevelBatch(*boards.take(solved)))
+        solutions = solve_batch(take_levels(levels, solved))
         known = solutions.status == Status.SOLVED
         result["moves_over_optimal"] = float(moves[solved][known].sum() / solutions.length[known].sum())
     return result
-
-
-def _boards(batch: LevelBatch) -> Boards:
-    return Boards(batch.wall, batch.target, batch.boxes, batch.player)
-
-
-def _chunks(boards: Boards, size: int = 1024) -> int:
-    return -(-len(boards.player) // size)
 
 
 def main() -> None:
@@ -122,9 +119,9 @@ def main() -> None:
     options = tyro.cli(Options)
     torch.set_num_threads(options.threads)
     try:
-        boards = options.boards()
+        levels = options.level_batch()
         planner = load(options.weights, options.device)
-        result = evaluate(planner, boards, options)
+        result = evaluate(planner, levels, options)
     except (ValueError, OSError) as error:
         print(f"evaluate: {error}", file=sys.stderr)
         sys.exit(2)

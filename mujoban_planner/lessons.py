@@ -18,13 +18,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mujoban_planner.boards import take_levels
 from mujoban_planner.planner import ARCHITECTURES, LearnedPlanner
-from mujoban_planner.play import Boards, Game, play
-from mujoban_planner.samples import Samples, concatenate, take
-from mujoban_planner.teacher import Starts, Teacher, deadly_instruction, starts_of
+from mujoban_planner.play import Game, play
+from mujoban_planner.samples import Samples, concatenate
+from mujoban_planner.teacher import Teacher, label_deadly, possible_pushes
 from mujoban_rl.weights import WeightsError, load_weights
 from mujoban_sim.generator import TRAIN_SEEDS, generate_batch
-from mujoban_sim.solver_search import UNSOLVABLE
+from mujoban_sim.levels import LevelBatch
+from mujoban_sim.solver import Status
 
 _WALK_SHARE: Final = 0.35
 """Share of walking states that is kept; pushes decide a level."""
@@ -52,7 +54,7 @@ class LessonMaker:
         self._mix = {d: share / sum(mix.values()) for d, share in mix.items() if share > 0}
         self._teacher = Teacher()
 
-    def levels(self, n: int) -> list[Boards]:
+    def levels(self, n: int) -> list[LevelBatch]:
         """Return about `n` fresh levels, one part per difficulty."""
         counts = self._rng.multinomial(n, list(self._mix.values()))
         parts = []
@@ -60,16 +62,14 @@ class LessonMaker:
             if count:
                 seeds = range(self._next, self._next + count)
                 self._next += count
-                batch = generate_batch(difficulty, seeds)
-                parts.append(Boards(batch.wall, batch.target, batch.boxes, batch.player))
+                parts.append(generate_batch(difficulty, seeds))
         return parts
 
     def demonstrations(self, n: int = 256) -> Samples:
         """Return samples of the solutions of `n` fresh levels, thinned on walks."""
-        parts = [self._teacher.demonstrate(starts_of(b), self._rng)[0] for b in self.levels(n)]
-        samples = concatenate(parts)
-        walking = ~samples.push & (samples.right != 0)
-        return take(samples, ~walking | (self._rng.random(len(walking)) < _WALK_SHARE))
+        samples = concatenate([self._teacher.demonstrate(levels, self._rng) for levels in self.levels(n)])
+        walking = (samples.right != 0) & (samples.right & possible_pushes(samples.boards) == 0)
+        return samples.take(~walking | (self._rng.random(len(walking)) < _WALK_SHARE))
 
     def corrections(self, planner: LearnedPlanner, n: int = 128) -> Samples:
         """Let the planner play `n` fresh levels and return what it should have done where it went wrong.
@@ -77,44 +77,44 @@ class LessonMaker:
         A lost level is searched for the instruction that lost it; the demonstration starts from the state before.
         """
         parts = []
-        for boards in self.levels(n):
+        for levels in self.levels(n):
             exploration = 0.05 if self._rng.random() < 0.5 else 0.0
             game = play(
-                planner, boards, limit=_PLAY_LIMIT, exploration=exploration, rng=self._rng, reduced_precision=True
+                planner, levels, limit=_PLAY_LIMIT, exploration=exploration, rng=self._rng, reduced_precision=True
             )
-            parts.extend(self._correct(boards, game))
+            parts.extend(self._correct(levels, game))
         return concatenate(parts)
 
-    def _correct(self, boards: Boards, game: Game) -> list[Samples]:
+    def _correct(self, levels: LevelBatch, game: Game) -> list[Samples]:
         batch = np.arange(len(game.moves))
         length = np.where(game.solved, game.moves, _PLAY_LIMIT)
-        first_dead = self._first_dead(boards, game)
+        first_dead = self._first_dead(levels, game)
         lost = first_dead > 0
         parts = []
         # Where it went wrong: the state before, what killed it, and a dead state.
         rows = batch[lost]
         if rows.size:
-            before = _states(boards, game, rows, first_dead[rows] - 1)
-            parts.append(self._teacher.demonstrate(before, self._rng, trials=1, keep=12)[0])
-            parts.append(deadly_instruction(before, game.instructions[rows, first_dead[rows] - 1]))
+            before = _states(levels, game, rows, first_dead[rows] - 1)
+            parts.append(self._teacher.demonstrate(before, self._rng, trials=1, keep=12))
+            parts.append(label_deadly(before, game.instructions[rows, first_dead[rows] - 1]))
             later = self._rng.integers(first_dead[rows], length[rows] + 1)
-            parts.append(self._teacher.demonstrate(_states(boards, game, rows, later), self._rng)[0])
+            parts.append(self._teacher.demonstrate(_states(levels, game, rows, later), self._rng))
         # Anywhere on its way: what it sees that demonstrations do not visit.
         alive_until = np.where(lost, np.maximum(first_dead - 1, 1), length)
-        somewhere = _states(boards, game, batch, self._rng.integers(0, alive_until))
-        parts.append(self._teacher.demonstrate(somewhere, self._rng, trials=1, keep=8)[0])
+        somewhere = _states(levels, game, batch, self._rng.integers(0, alive_until))
+        parts.append(self._teacher.demonstrate(somewhere, self._rng, trials=1, keep=8))
         return parts
 
-    def _first_dead(self, boards: Boards, game: Game) -> NDArray[np.int64]:
+    def _first_dead(self, levels: LevelBatch, game: Game) -> NDArray[np.int64]:
         """Return the first time at which the solver proves each level lost, [B]; -1 where it was never lost."""
         batch = np.arange(len(game.moves))
         alive, dead = np.zeros(len(batch), np.int64), np.full(len(batch), _PLAY_LIMIT)
         open_ = batch[~game.solved]
-        status = self._teacher.judge(_states(boards, game, open_, dead[open_]))
-        lost = open_[status == UNSOLVABLE]
+        status = self._teacher.judge(_states(levels, game, open_, dead[open_]))
+        lost = open_[status == Status.UNSOLVABLE]
         while (pending := lost[dead[lost] - alive[lost] > 1]).size:
             middle = (alive[pending] + dead[pending]) // 2
-            gone = self._teacher.judge(_states(boards, game, pending, middle)) == UNSOLVABLE
+            gone = self._teacher.judge(_states(levels, game, pending, middle)) == Status.UNSOLVABLE
             dead[pending[gone]] = middle[gone]
             alive[pending[~gone]] = middle[~gone]
         first = np.full(len(batch), -1)
@@ -122,11 +122,9 @@ class LessonMaker:
         return first
 
 
-def _states(boards: Boards, game: Game, rows: NDArray[np.int64], times: NDArray[np.int64]) -> Starts:
+def _states(levels: LevelBatch, game: Game, rows: NDArray[np.int64], times: NDArray[np.int64]) -> LevelBatch:
     """Return the states of levels `rows` before their instruction number `times`."""
-    return starts_of(
-        Boards(boards.wall[rows], boards.target[rows], game.boxes[rows, times], game.player[rows, times])
-    )
+    return take_levels(levels, rows)._replace(boxes=game.boxes[rows, times], player=game.player[rows, times])
 
 
 class LessonProcess:

@@ -14,12 +14,10 @@ import torch
 from numpy.typing import NDArray
 
 from mujoban_planner.abstract_env import MOVE_LIMIT, AbstractEnvironment
+from mujoban_planner.boards import likeliest_boards, state_tensor
 from mujoban_planner.decision import VisitMemory, count_visits, initial_visits, remember, state_keys, visit_penalty
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state
-from mujoban_planner.samples import pack_boards
 from mujoban_planner.search import search
-from mujoban_planner.teacher import Starts
-from mujoban_sim.grid import AGENT, BOX, TARGET, WALL
 from mujoban_sim.interfaces import Memory, Planner
 
 _RETRY: Final = 6
@@ -78,33 +76,16 @@ class LookAheadPlanner(Planner):
         self, states: NDArray[np.float32], rows: NDArray[np.int64], plan: NDArray[np.int64], wait: NDArray[np.int64]
     ) -> None:
         """Write the plans found for `states` into `plan` at `rows`, and when to try again into `wait`."""
-        found = search(self.planner, starts_of_states(states), expansions=self.expansions, limit=MOVE_LIMIT)
+        found = search(self.planner, likeliest_boards(states), expansions=self.expansions, limit=MOVE_LIMIT)
         self.evaluations += int(found.expansions.sum())
         for row, instructions in zip(rows, found.instructions, strict=True):
             plan[row, : len(instructions)] = instructions
             wait[row] = 0 if len(instructions) else _RETRY
 
 
-def starts_of_states(abstract_state: NDArray[np.float32]) -> Starts:
-    """Return the likeliest boards of abstract states, [M, N, N, 4]."""
-    certain = abstract_state > 0.5
-    agent = state_keys(abstract_state)[1]
-    row, column = np.clip(agent // 10, 1, 8), np.clip(agent % 10, 1, 8)
-    wall = certain[..., WALL].copy()
-    boxes = certain[..., BOX] & ~wall
-    wall[np.arange(len(wall)), row, column] = False
-    boxes[np.arange(len(wall)), row, column] = False
-    square = ((row - 1) * 8 + column - 1).astype(np.uint8)
-    return Starts(pack_boards(wall), pack_boards(certain[..., TARGET]), pack_boards(boxes), square)
-
-
 def _next_keys(abstract_state: NDArray[np.float32], decision: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the keys of the states that the decisions lead to if nothing fails."""
     env = AbstractEnvironment(len(decision))
-    states = torch.from_numpy((abstract_state > 0.5).astype(np.float32))
-    states[..., AGENT] = 0
-    cell = state_keys(abstract_state)[1]
-    states[torch.arange(len(decision)), torch.from_numpy(cell // 10), torch.from_numpy(cell % 10), AGENT] = 1
-    env.reset_to(torch.arange(len(decision)), states)
+    env.reset_to(torch.arange(len(decision)), state_tensor(likeliest_boards(abstract_state)))
     env.step(torch.from_numpy(decision))
     return state_keys(env.observe().numpy())[0]

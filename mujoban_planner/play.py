@@ -13,37 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from mujoban_planner.abstract_env import MOVE_LIMIT
+from mujoban_planner.boards import abstract_states, take_levels
 from mujoban_sim import rules
-from mujoban_sim.grid import AGENT, BOX, CHANNELS, TARGET, WALL
 from mujoban_sim.interfaces import Planner, put_rows, take_rows
-
-
-class Boards(NamedTuple):
-    """States of levels as the rules take them."""
-
-    wall: NDArray[np.bool_]
-    """[B, N, N]."""
-    target: NDArray[np.bool_]
-    """[B, N, N]."""
-    boxes: NDArray[np.int64]
-    """(row, column), [B, K, 2]; negative where absent."""
-    player: NDArray[np.int64]
-    """(row, column), [B, 2]."""
-
-    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Boards:
-        """Return the given rows."""
-        return Boards(*(x[rows] for x in self))
-
-    def abstract_states(self) -> NDArray[np.float32]:
-        """Return s_abst of every level, [B, N, N, 4]."""
-        batch = len(self.player)
-        state = np.zeros((*self.wall.shape, len(CHANNELS)), np.float32)
-        state[..., WALL], state[..., TARGET] = self.wall, self.target
-        state[np.arange(batch), self.player[:, 0], self.player[:, 1], AGENT] = 1.0
-        level, box = np.nonzero(self.boxes[..., 0] >= 0)
-        cells = self.boxes[level, box]
-        state[level, cells[:, 0], cells[:, 1], BOX] = 1.0
-        return state
+from mujoban_sim.levels import LevelBatch
 
 
 class Game(NamedTuple):
@@ -68,7 +41,7 @@ class Game(NamedTuple):
 
 def play(
     planner: Planner,
-    boards: Boards,
+    levels: LevelBatch,
     *,
     limit: int = MOVE_LIMIT,
     exploration: float = 0.0,
@@ -79,32 +52,32 @@ def play(
 
     Args:
         planner: Any planner; each level is an episode of its own.
-        boards: Starts.
+        levels: Starts, or any states.
         limit: T.
         exploration: Probability of a random move in place of the decision; needs `rng`.
         rng: Source of exploration.
         reduced_precision: Run a network in bfloat16, which pays for large batches.
     """
-    batch = len(boards.player)
+    batch = len(levels.player)
     moves = np.full(batch, -1, np.int64)
     instructions = np.full((batch, limit), -1, np.int64)
-    box_history = np.repeat(boards.boxes[:, None], limit + 1, axis=1)
-    player_history = np.repeat(boards.player[:, None], limit + 1, axis=1)
+    box_history = np.repeat(levels.boxes[:, None], limit + 1, axis=1)
+    player_history = np.repeat(levels.player[:, None], limit + 1, axis=1)
     active = np.arange(batch)
     memory = planner.initial_state(np.zeros(batch, np.int64)).memory
     decisions = 0
     autocast = torch.autocast("cpu", torch.bfloat16) if reduced_precision else nullcontext()
     for t in range(limit):
         with autocast:
-            decision, after = planner.decide(boards.abstract_states(), take_rows(memory, active))
+            decision, after = planner.decide(abstract_states(levels), take_rows(memory, active))
         memory = put_rows(memory, active, after)
         decisions += len(active)
         if exploration > 0.0:
             assert rng is not None
             chance = rng.random(len(active)) < exploration
             decision = np.where(chance, rng.integers(1, 5, len(active)), decision)
-        result = rules.apply(*boards, decision)
-        boards = boards._replace(boxes=result.boxes, player=result.player)
+        result = rules.apply(*levels, decision)
+        levels = levels._replace(boxes=result.boxes, player=result.player)
         instructions[active, t] = decision
         box_history[active, t + 1 :] = result.boxes[:, None]
         player_history[active, t + 1 :] = result.player[:, None]
@@ -112,5 +85,5 @@ def play(
         going = ~result.solved
         if not going.any():
             break
-        active, boards = active[going], boards.take(going)
+        active, levels = active[going], take_levels(levels, going)
     return Game(moves, instructions, decisions, box_history, player_history)

@@ -23,8 +23,8 @@ from torch.nn import functional
 
 from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.bag_transitions import BagTransitions
+from mujoban_planner.boards import abstract_states
 from mujoban_planner.planner import INSTRUCTIONS, LearnedPlanner
-from mujoban_planner.play import Boards
 from mujoban_planner.validation import NetworkConfig, solve_rates
 from mujoban_rl.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
 from mujoban_rl.replay import TimeMajorReplay, windowed_returns
@@ -86,7 +86,7 @@ class LevelStream:
             seeds = range(self.next_seed, self.next_seed + len(rows))
             assert seeds[0] in TRAIN_SEEDS and seeds[-1] in TRAIN_SEEDS
             self.next_seed += len(rows)
-            states[rows] = Boards(*generate_batch(int(d), seeds)).abstract_states()
+            states[rows] = abstract_states(generate_batch(int(d), seeds))
         return torch.from_numpy(states)
 
 

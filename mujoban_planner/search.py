@@ -19,10 +19,9 @@ from numba import njit
 from numpy.typing import NDArray
 from torch.nn import functional
 
+from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_planner.samples import CELLS, state_tensor
-from mujoban_planner.teacher import Starts
-from mujoban_sim.bitboard import NONE, ONE, SQUARE_STEP, Bits, bit, flood, lowest, shift
+from mujoban_sim.bitboard import NONE, ONE, SQUARE_STEP, SQUARES, Bits, bit, flood, lowest, shift
 from mujoban_sim.grid import Instruction
 from mujoban_sim.solver_labels import moves_of, walk_distances
 
@@ -55,7 +54,7 @@ class Found(NamedTuple):
     """Network evaluations of each level, [M]."""
 
 
-def search(planner: LearnedPlanner, starts: Starts, *, expansions: int, limit: int) -> Found:
+def search(planner: LearnedPlanner, starts: BitBoards, *, expansions: int, limit: int) -> Found:
     """Search each level for a way to solve it.
 
     Args:
@@ -70,7 +69,7 @@ def search(planner: LearnedPlanner, starts: Starts, *, expansions: int, limit: i
         if not batch:
             break
         rows = np.array([tree.row for tree, _ in batch])
-        boards = Starts(
+        boards = BitBoards(
             starts.wall[rows],
             starts.target[rows],
             np.array([node.box for _, node in batch], np.uint64),
@@ -84,10 +83,10 @@ def search(planner: LearnedPlanner, starts: Starts, *, expansions: int, limit: i
 
 
 @torch.inference_mode()
-def _evaluate(planner: LearnedPlanner, boards: Starts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _evaluate(planner: LearnedPlanner, boards: BitBoards) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return log-probabilities of pushes, [M, 4, I * I], and log p(alive), [M]."""
     device = next(planner.parameters()).device
-    output = planner(state_tensor(*boards).to(device))
+    output = planner(state_tensor(boards).to(device))
     alive = functional.logsigmoid(-output.dead[:, Instruction.STAY])
     return output.push.flatten(2).double().cpu().numpy(), alive.double().cpu().numpy()
 
@@ -95,7 +94,7 @@ def _evaluate(planner: LearnedPlanner, boards: Starts) -> tuple[NDArray[np.float
 class _Tree:
     """The search in one level."""
 
-    def __init__(self, starts: Starts, row: int, limit: int) -> None:
+    def __init__(self, starts: BitBoards, row: int, limit: int) -> None:
         self.row = row
         self.expanded = 0
         self.solution: tuple[int, ...] | None = None
@@ -164,10 +163,10 @@ def _legal_pushes(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return the box square, the direction and the steps to walk before it of every push that is possible."""
     free = ~wall & ~box
-    distance = np.empty(CELLS, np.int8)
+    distance = np.empty(SQUARES, np.int8)
     walk_distances(agent, free, distance)
     reached = flood(bit(agent), free)
-    squares, directions, steps = np.empty((3, CELLS * 4), np.int64)
+    squares, directions, steps = np.empty((3, SQUARES * 4), np.int64)
     n = 0
     for direction in range(4):
         pushable = shift(reached, direction) & box & shift(free, (direction + 2) % 4)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from mujoban_planner.planner import ARCHITECTURES, LearnedPlanner
-from mujoban_planner.play import Boards, play
+from mujoban_planner.play import play
 from mujoban_sim.generator import TEST_SEEDS, generate_batch
+from mujoban_sim.levels import LevelBatch
 
 _FIRST_SEED: Final = 9_000_000
 _EPISODES: Final = {5: 256, 4: 64, 1: 64}
@@ -38,17 +39,17 @@ class NetworkConfig:
         return ARCHITECTURES[self.architecture](channels=self.channels, propagation=self.propagation, **shape)
 
 
-def validation_boards(difficulty: int, n: int) -> Boards:
+def validation_levels(difficulty: int, n: int) -> LevelBatch:
     """Return `n` held-out levels."""
     seeds = range(_FIRST_SEED, _FIRST_SEED + n)
     assert seeds[0] in TEST_SEEDS and seeds[-1] in TEST_SEEDS
-    return Boards(*generate_batch(difficulty, seeds))
+    return generate_batch(difficulty, seeds)
 
 
 def solve_rates(planner: LearnedPlanner, *, reduced_precision: bool) -> dict[str, float]:
     """Return the share of held-out levels that a planner solves alone, by difficulty."""
     rates = {}
     for difficulty, n in _EPISODES.items():
-        game = play(planner, validation_boards(difficulty, n), reduced_precision=reduced_precision)
+        game = play(planner, validation_levels(difficulty, n), reduced_precision=reduced_precision)
         rates[f"solve_rate/{difficulty}"] = float(game.solved.mean())
     return rates

@@ -3,20 +3,21 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from mujoban_planner.abstract_env import STEP_REWARD, AbstractEnvironment
-from mujoban_planner.play import Boards
+from mujoban_planner.boards import abstract_states
 from mujoban_sim import rules
 from mujoban_sim.generator import generate_batch, generate_level
 
 
 def _environment(boards, **options):
     env = AbstractEnvironment(len(boards.player), **options)
-    env.reset_to(torch.arange(env.batch), torch.from_numpy(boards.abstract_states()))
+    env.reset_to(torch.arange(env.batch), torch.from_numpy(abstract_states(boards)))
     return env
 
 
 def _boards(difficulty, seed, n):
-    return Boards(*generate_batch(difficulty, range(seed, seed + n)))
+    return generate_batch(difficulty, range(seed, seed + n))
 
 
 @settings(max_examples=15, deadline=None)
@@ -30,7 +31,7 @@ def test_rules_and_rewards_are_those_of_the_simulator(difficulty, seed, actions)
         outcome = env.step(torch.from_numpy(instruction))
         expected = rules.apply(*boards, np.where(over, 0, instruction))
         boards = boards._replace(boxes=expected.boxes, player=expected.player)
-        assert np.array_equal(env.observe().numpy(), boards.abstract_states())
+        assert np.array_equal(env.observe().numpy(), abstract_states(boards))
         assert np.array_equal(outcome.solved.numpy(), expected.solved)
         reward = np.where(over, 0.0, expected.reward + np.float32(STEP_REWARD))
         assert np.allclose(outcome.reward.numpy(), reward)
@@ -66,7 +67,7 @@ def test_failed_instructions_change_nothing_and_end_the_abstract_episode():
 
 def test_bad_input_is_named():
     env = AbstractEnvironment(2)
-    with pytest.raises(ValueError, match="0..4"):
+    with pytest.raises(ValueError, match="expected"):
         env.step(torch.tensor([0, 5]))
     with pytest.raises(ValueError, match="1 rows for 2 levels"):
         env.reset(torch.tensor([0]), [generate_level(1, 0), generate_level(1, 1)])

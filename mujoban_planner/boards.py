@@ -1,0 +1,110 @@
+"""States in the forms that the planner's parts want: level batches, 64-bit boards, abstract states.
+
+The interior of a level has 8 x 8 cells, so each layer of a state is one 64-bit board as in `mujoban_sim.bitboard`.
+
+Shapes: B levels, M boards, K boxes, N = `grid.GRID_SIZE`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mujoban_planner.symmetry import cell_sources
+from mujoban_sim.bitboard import SIDE, SQUARES
+from mujoban_sim.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
+from mujoban_sim.levels import LevelBatch
+
+
+class BitBoards(NamedTuple):
+    """States of M levels."""
+
+    wall: NDArray[np.uint64]
+    """[M]."""
+    target: NDArray[np.uint64]
+    """[M]."""
+    box: NDArray[np.uint64]
+    """[M]."""
+    agent: NDArray[np.uint8]
+    """Square of the robot, [M]."""
+
+
+def take_levels(levels: LevelBatch, rows: NDArray[Any]) -> LevelBatch:
+    """Return the given rows, by index or mask."""
+    return LevelBatch(levels.wall[rows], levels.target[rows], levels.boxes[rows], levels.player[rows])
+
+
+def abstract_states(levels: LevelBatch) -> NDArray[np.float32]:
+    """Return s_abst of every level, [B, N, N, 4]."""
+    state = np.zeros((*levels.wall.shape, len(CHANNELS)), np.float32)
+    state[..., WALL], state[..., TARGET], state[..., BOX] = levels.wall, levels.target, _box_layer(levels)
+    state[np.arange(len(levels.player)), levels.player[:, 0], levels.player[:, 1], AGENT] = 1.0
+    return state
+
+
+def bit_boards(levels: LevelBatch) -> BitBoards:
+    """Return levels as 64-bit boards."""
+    agent = (levels.player[:, 0] - 1) * SIDE + levels.player[:, 1] - 1
+    box = pack_boards(_box_layer(levels))
+    return BitBoards(pack_boards(levels.wall), pack_boards(levels.target), box, agent.astype(np.uint8))
+
+
+def likeliest_boards(abstract_state: NDArray[np.float32]) -> BitBoards:
+    """Return the likeliest boards of abstract states, [M, N, N, 4]; nothing stands in a wall or in the robot's cell."""
+    certain = abstract_state > 0.5
+    interior = abstract_state[:, 1:-1, 1:-1, AGENT].reshape(len(abstract_state), SQUARES)
+    agent = interior.argmax(1)
+    here = np.uint64(1) << agent.astype(np.uint64)
+    wall = pack_boards(certain[..., WALL]) & ~here
+    box = pack_boards(certain[..., BOX]) & ~wall & ~here
+    return BitBoards(wall, pack_boards(certain[..., TARGET]) & ~wall, box, agent.astype(np.uint8))
+
+
+def pack_boards(layers: NDArray[np.bool_]) -> NDArray[np.uint64]:
+    """Return the interiors of layers bool [M, N, N] as 64-bit boards, [M]."""
+    interior = np.ascontiguousarray(layers[:, 1:-1, 1:-1]).reshape(len(layers), SQUARES)
+    return np.packbits(interior, axis=1, bitorder="little").view("<u8")[:, 0].astype(np.uint64)
+
+
+def state_tensor(boards: BitBoards, symmetry: NDArray[np.int64] | None = None) -> Tensor:
+    """Return abstract states, float32 [M, N, N, 4], each under its symmetry (int64 [M], see `symmetry`) if given."""
+    n = len(boards.agent)
+    state = np.zeros((n, GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32)
+    _fill_states(*boards, np.zeros(n, np.int64) if symmetry is None else symmetry, cell_sources(SIDE), state)
+    return torch.from_numpy(state)
+
+
+def _box_layer(levels: LevelBatch) -> NDArray[np.bool_]:
+    layer = np.zeros(levels.wall.shape, np.bool_)
+    level, index = np.nonzero(levels.boxes[..., 0] >= 0)
+    cells = levels.boxes[level, index]
+    layer[level, cells[:, 0], cells[:, 1]] = True
+    return layer
+
+
+@njit(cache=True, nogil=True)
+def _fill_states(
+    wall: NDArray[np.uint64],
+    target: NDArray[np.uint64],
+    box: NDArray[np.uint64],
+    agent: NDArray[np.uint8],
+    symmetry: NDArray[np.int64],
+    sources: NDArray[np.int64],
+    state: NDArray[np.float32],
+) -> None:
+    one = np.uint64(1)
+    for i in range(len(agent)):
+        state[i, :, :, WALL] = 1.0
+        for c in range(SQUARES):
+            source = np.uint64(sources[symmetry[i], c])
+            row, column = c // SIDE + 1, c % SIDE + 1
+            state[i, row, column, WALL] = np.float32((wall[i] >> source) & one)
+            state[i, row, column, TARGET] = np.float32((target[i] >> source) & one)
+            state[i, row, column, BOX] = np.float32((box[i] >> source) & one)
+            if source == np.uint64(agent[i]):
+                state[i, row, column, AGENT] = 1.0

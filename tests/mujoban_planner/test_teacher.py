@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+import torch
+from mujoban_planner.boards import abstract_states, bit_boards, likeliest_boards, state_tensor, take_levels
+from mujoban_planner.lessons import LessonMaker
+from mujoban_planner.planner import ResidualPlanner, input_planes
+from mujoban_planner.propagation import legal_pushes, propagate, walk_to_push
+from mujoban_planner.samples import SampleBuffer, make_batch, unlabelled
+from mujoban_planner.symmetry import SYMMETRIES, transform_planes
+from mujoban_planner.teacher import DISCOUNT, Teacher, label_deadly
+
+from mujoban_sim import rules
+from mujoban_sim.generator import generate_batch
+from mujoban_sim.levels import Level, stack_levels
+from mujoban_sim.solver import Status, solve_batch
+
+
+@pytest.fixture(scope="module")
+def levels():
+    return generate_batch(5, range(24))
+
+
+@pytest.fixture(scope="module")
+def samples(levels):
+    return Teacher().demonstrate(levels, np.random.default_rng(0), trials=4)
+
+
+def test_boards_round_trip_through_every_form(levels):
+    states = abstract_states(levels)
+    assert np.array_equal(state_tensor(bit_boards(levels)).numpy(), states)
+    for one, other in zip(likeliest_boards(states), bit_boards(levels), strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_following_right_instructions_solves_the_level_with_the_promised_return(levels):
+    teacher, rng = Teacher(), np.random.default_rng(1)
+    part = take_levels(levels, np.arange(4))
+    state, total, factor, over = part, np.zeros(4), 1.0, np.zeros(4, bool)
+    promised = None
+    for _ in range(150):
+        ends = np.zeros(4, bool)
+        instruction = np.zeros(4, np.int64)
+        for i in np.flatnonzero(~over):
+            shown = teacher.demonstrate(take_levels(state, np.array([i])), rng, trials=0, keep=1)
+            instruction[i] = int(shown.right[0]).bit_length() - 1
+            if promised is None or i not in promised:
+                promised = {**(promised or {}), i: shown.value[0]}
+        result = rules.apply(*state, instruction)
+        state = state._replace(boxes=result.boxes, player=result.player)
+        total += factor * np.where(over, 0.0, result.reward - 0.01)
+        ends = result.solved & ~over
+        over |= ends
+        factor *= DISCOUNT
+        if over.all():
+            break
+    assert over.all()
+    assert promised is not None
+    assert total == pytest.approx([promised[i] for i in range(4)], abs=0.05)
+
+
+def test_labels_turn_with_the_board(samples):
+    shown = np.flatnonzero(samples.right)[:64]
+    part = samples.take(shown)
+    upright = make_batch(part, np.zeros(len(shown), np.int64))
+    for symmetry in range(SYMMETRIES):
+        batch = make_batch(part, np.full(len(shown), symmetry))
+        assert torch.equal(batch.state, transform_planes(upright.state, symmetry))
+        planes = input_planes(batch.state)
+        legal = legal_pushes(planes, propagate(planes)[:, 0])
+        assert (legal.flatten(1).gather(1, batch.next_push[:, None]) == 1).all()
+        # The walk that the value iteration reads off the next push is one of the right instructions.
+        wanted = torch.zeros(len(shown), 256).scatter_(1, batch.next_push[:, None], 1.0).view(-1, 4, 8, 8)
+        towards, start = walk_to_push(wanted, planes)
+        guided = (towards + 2 * start).argmax(1) + 1
+        assert batch.right.gather(1, guided[:, None]).all()
+        plan = batch.plan.flatten(1).gather(1, (batch.next_push % 64)[:, None])[:, 0]
+        assert torch.equal(plan, batch.next_push // 64 + 1)
+
+
+def test_dead_labels_are_what_the_solver_proves(samples):
+    dead = np.flatnonzero(samples.dead == 31)[:20]
+    assert dead.size
+    assert not samples.right[dead].any()
+    states = state_tensor(samples.take(dead).boards).numpy()
+    cells = [np.argwhere(s[..., 3] > 0) for s in states]
+    levels = stack_levels(
+        [
+            Level(s[..., 0] > 0, s[..., 1] > 0, c, tuple(int(x) for x in np.argwhere(s[..., 2] > 0)[0]))
+            for s, c in zip(states, cells, strict=True)
+        ]
+    )
+    assert (solve_batch(levels).status == Status.UNSOLVABLE).all()
+    alive = samples.right != 0
+    assert (samples.dead[alive] & samples.right[alive] == 0).all()
+    assert (samples.dead & ~samples.dead_known == 0).all()
+
+
+def test_deadly_instruction_labels_nothing_else(levels):
+    part = take_levels(levels, np.arange(2))
+    samples = label_deadly(part, np.array([1, 3]))
+    assert samples.dead.tolist() == [2, 8]
+    assert samples.dead_known.tolist() == [3, 9]
+    assert not samples.right.any()
+
+
+def test_lessons_are_deterministic_and_streams_differ():
+    mix = {1: 0.5, 5: 0.5}
+    first, again, other = (LessonMaker(stream, mix).demonstrations(12) for stream in (0, 0, 1))
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert len(other.agent) != len(first.agent) or not np.array_equal(first.wall, other.wall)
+    with pytest.raises(ValueError, match="stream -1"):
+        LessonMaker(-1, mix)
+
+
+def test_corrections_show_the_way_from_where_an_untrained_planner_went_wrong():
+    samples = LessonMaker(3, {5: 1.0}).corrections(ResidualPlanner(8, 1).eval(), n=6)
+    deadly = (samples.dead != 0) & (samples.dead != 31)
+    assert (samples.right != 0).any() and deadly.any()
+
+
+def test_buffer_keeps_the_newest_samples(samples):
+    buffer = SampleBuffer(100)
+    marked = unlabelled(samples.take(np.arange(250)).boards)
+    for first in range(0, 250, 50):
+        part = marked.take(np.arange(first, first + 50))
+        buffer.add(part._replace(value=np.arange(first, first + 50, dtype=np.float32)))
+    drawn = buffer.draw(500, np.random.default_rng(0))
+    assert drawn.value.min() >= 150
+    with pytest.raises(ValueError, match="buffer of 100"):
+        buffer.add(marked)
