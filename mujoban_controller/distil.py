@@ -33,17 +33,17 @@ _KINDS = len(GoalKind) - 1
 class DistilConfig:
     """Settings of distillation."""
 
-    length: int = 16
+    length: int = 8
     """T, ticks of a sequence."""
-    sequences: int = 8
+    sequences: int = 16
     """M, sequences of a batch."""
-    replay: int = 10_000
+    replay: int = 20_000
     """Sequences in the replay."""
     reuse: float = 3.0
     """Times that each frame is trained on, on average."""
     warm_up: int = 100_000
     """Frames over which the share of rows that the teacher drives falls from one to `teacher_share`."""
-    teacher_share: float = 0.2
+    teacher_share: float = 0.3
     noise: float = 0.1
     """Deviation of the noise on the torques of a third of the rows, which shows the student more states."""
     learning_rate: float = 1e-3

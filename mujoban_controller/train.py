@@ -143,6 +143,7 @@ class TrainingRun:
         self.options, self.config = options, options.config
         self.directory = RunDirectory(options.run, self.config)
         done = self._steps_done()
+        self._metrics: dict[str, Any] = {}
         self.learner = make_learner(self.config, threads=options.threads, device=options.device, stream=done)
         learner = self.learner
         snapshot = self.directory.load(modules=learner.modules, optimisers=learner.optimisers)
@@ -159,8 +160,9 @@ class TrainingRun:
         with TrainingLog(self.directory, total=steps, initial=learner.frames, unit="frame") as log:
             with StopSignal() as stop:
                 self._loop(log, stop, TimeLimit(self.options.seconds))
+            if learner.frames >= steps:
+                self._evaluate(log)
             self._save()
-            self._export(self._evaluate(log) if learner.frames >= steps else {})
 
     def _loop(self, log: TrainingLog, stop: StopSignal, limit: TimeLimit) -> None:
         learner, options = self.learner, self.options
@@ -178,7 +180,7 @@ class TrainingRun:
                 self._save()
             if learner.frames - evaluated >= options.evaluate_every:
                 evaluated = learner.frames
-                self._export(self._evaluate(log))
+                self._evaluate(log)
 
     def _save(self) -> None:
         learner = self.learner
@@ -186,8 +188,9 @@ class TrainingRun:
             learner.frames, modules=learner.modules, optimisers=learner.optimisers,
             extra={"updates": learner.updates},
         )  # fmt: skip
+        self._export()
 
-    def _export(self, metrics: dict[str, Any]) -> None:
+    def _export(self) -> None:
         config, learner = self.config, self.learner
         record = {
             **provenance(),
@@ -197,16 +200,16 @@ class TrainingRun:
             "data": f"generated levels of difficulty {config.task.difficulty}, seeds of TRAIN_SEEDS",
             "steps": learner.frames,
             "updates": learner.updates,
-            "metrics": metrics,
+            "metrics": self._metrics,
         }
         name = "teacher" if config.stage == "teacher" else "controller"
         path = self.directory.path / f"{name}.safetensors"
         save_weights(path, learner.product, learner.product.config, record)
 
-    def _evaluate(self, log: TrainingLog) -> dict[str, Any]:
+    def _evaluate(self, log: TrainingLog) -> None:
         options, learner = self.options, self.learner
         if not options.evaluation_episodes:
-            return {}
+            return
         product: nn.Module = learner.product
         product.eval()
         report = judge(
@@ -219,7 +222,7 @@ class TrainingRun:
         values |= {f"evaluation/{kind}": kinds[kind]["success_rate"] for kind in kinds}
         log.scalars(learner.frames, values)
         log.message(f"{learner.frames} frames: {report['success_rate']:.3f} of levels solved; lost {report['lost']}")
-        return report
+        self._metrics = {"steps": learner.frames, **report}
 
 
 def flatten(summary: OutcomeSummary) -> dict[str, float]:
