@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import tempfile
@@ -136,9 +137,9 @@ class Processes:
         """Stop them."""
         self.stop()
 
-    def pid(self, name: str) -> int:
-        """Return the process id of a node."""
-        return self._children[name].pid
+    def kill(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to a node."""
+        self._children[name].send_signal(number)
 
     def supervise(self) -> None:
         """Start again what has ended.

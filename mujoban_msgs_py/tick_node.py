@@ -64,6 +64,17 @@ class TickNode(Node):
         self._outputs: Sequence[Output] = ()
         self._open: tuple[int, dict[str, Any]] | None = None
         self._offers = 0
+        self._destroyed = False
+
+    def destroy_node(self) -> None:
+        """End the node; what an executor still has in its queue for it is left alone."""
+        self._destroyed = True
+        super().destroy_node()
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Messages that belong to no tick that was ever complete, by topic."""
+        return Counter() if self._join is None else self._join.dropped
 
     @abstractmethod
     def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
@@ -89,7 +100,7 @@ class TickNode(Node):
 
     def retry(self) -> None:
         """Ask `answer` again about the tick that it could not answer yet."""
-        if self._open is None:
+        if self._open is None or self._destroyed:
             return
         stamp, inputs = self._open
         episode = inputs[EPISODE.name]
@@ -105,6 +116,8 @@ class TickNode(Node):
         self.get_logger().error(reason, throttle_duration_sec=LOG_PERIOD)
 
     def _receive(self, topic: Topic, decode: Callable[[Any], Any], message: Any) -> None:
+        if self._destroyed:
+            return
         stamp = stamp_of(message)
         if topic is EPISODE:
             self._note_offer(stamp, message)

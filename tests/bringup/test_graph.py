@@ -1,0 +1,199 @@
+"""What the graph bears: nodes that die, services, bad input, a clock that does not wait, weights that change."""
+
+import signal
+import time
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Image, JointState
+from std_srvs.srv import SetBool, Trigger
+
+from bringup.command import Choice, Stack
+from bringup.graph import NODES, InProcess, Processes
+from bringup.monitor import MonitorNode
+from bringup.parameters import graph_parameters
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.topics import TICK
+from mujoban_sim.episodes import Episodes
+
+MODULES = ("estimator", "termination", "planner", "controller")
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_an_episode_ends_though_a_module_is_killed_and_started_again(play, name):
+    graph = play()
+    graph.spin_until(lambda: graph.simulator.ticks >= 30)
+    graph.graph.stop(name)
+    ticks = graph.simulator.ticks
+    graph.spin_until(lambda: graph.simulator.counts["repeated ticks"] >= 1)
+    assert graph.simulator.ticks <= ticks + 1, "the world has gone on without an answer"
+    graph.graph.start(name)
+    (result,) = graph.finish()
+    assert result.solved
+
+
+def test_an_episode_ends_though_all_modules_are_killed_and_started_again(play):
+    graph = play()
+    graph.spin_until(lambda: graph.simulator.ticks >= 30)
+    for name in MODULES:
+        graph.graph.stop(name)
+    for name in MODULES:
+        graph.graph.start(name)
+    (result,) = graph.finish()
+    assert result.solved
+
+
+def test_a_simulator_that_is_started_again_plays_the_same_episode_at_later_stamps(play, tmp_path):
+    graph = play(episodes=Episodes(2, 0, difficulty=1), progress_file=str(tmp_path / "progress.json"))
+    graph.spin_until(lambda: len(graph.monitor.results) == 1 and graph.monitor.episode.step == 10)
+    before = graph.monitor.episode
+    graph.graph.stop("simulator")
+    graph.graph.start("simulator")
+    first, second = graph.finish()
+    after = graph.monitor.episode
+    assert (first.seed, second.seed) == (0, 1) and first.solved and second.solved
+    assert after.seed == before.seed and after.level == before.level and after.episode > before.episode
+    stamps = list(graph.said.episodes)
+    assert stamps == sorted(stamps) and all(stamp % TICK == 0 for stamp in stamps)
+
+
+def test_processes_that_are_killed_are_started_again(ros, oracles):
+    episodes = Episodes(1, 0, difficulty=2)
+    parameters = graph_parameters(oracles, episodes)
+    with InProcess(parameters, ()) as graph, Processes(parameters) as processes:
+        monitor = graph.add(MonitorNode(1))
+        monitor.create_timer(0.1, processes.supervise)
+
+        def spin_until(condition):
+            deadline = time.monotonic() + 100
+            while not condition():
+                assert time.monotonic() < deadline, "the graph stands still"
+                graph.executor.spin_once(timeout_sec=0.05)
+
+        spin_until(lambda: monitor.ticks >= 20)
+        processes.kill("controller", signal.SIGKILL)
+        processes.kill("simulator", signal.SIGKILL)
+        spin_until(monitor.finished.done)
+        assert processes.restarts == {"controller": 1, "simulator": 1}
+        assert monitor.results[0].solved and monitor.results[0].seed == 0
+
+
+def test_pause_holds_the_world_and_step_advances_it_by_one_tick(play):
+    graph = play()
+    graph.spin_until(lambda: graph.simulator.ticks >= 5)
+    assert graph.call(SetBool, "/pause", SetBool.Request(data=True)).success
+    held = graph.simulator.ticks
+    for _ in range(3):
+        assert graph.call(Trigger, "/step", Trigger.Request()).success
+        held += 1
+        graph.spin_until(lambda expected=held: graph.simulator.ticks == expected)
+    time.sleep(0.1)
+    graph.graph.executor.spin_once(timeout_sec=0.1)
+    assert graph.simulator.ticks == held
+    assert graph.call(SetBool, "/pause", SetBool.Request(data=False)).success
+    assert not graph.call(Trigger, "/step", Trigger.Request()).success
+    assert graph.finish()[0].solved
+
+
+def test_reset_starts_the_same_episode_again(play):
+    graph = play()
+    graph.spin_until(lambda: graph.simulator.ticks >= 20)
+    assert graph.call(Trigger, "/reset", Trigger.Request()).success
+    (result,) = graph.finish()
+    assert result.solved and result.seed == 0
+    episodes = graph.said.episodes.values()
+    assert [e.episode for e in episodes if e.step == 0] == [1, 2]
+    assert len({(e.seed, e.level) for e in episodes}) == 1
+
+
+@pytest.mark.parametrize("effort", [[float("nan"), 0.0], [0.0, 1.5], [0.0]])
+def test_a_bad_torque_is_rejected_counted_and_zero_is_held(play, effort):
+    graph = play(names=[name for name in NODES if name != "controller"])
+    publisher = graph.tap.create_publisher(JointState, topics.TORQUE.name, topics.TORQUE.qos)
+    graph.spin_until(lambda: graph.said.instruction)
+    (stamp,) = graph.said.instruction
+    publisher.publish(JointState(header=conversions.header(stamp), effort=effort))
+    graph.spin_until(lambda: graph.simulator.ticks == 1)
+    assert graph.simulator.counts["rejected torques"] == 1
+    assert np.abs(graph.simulator.world.velocity).max() < 0.05
+
+
+def test_a_torque_of_an_unknown_episode_is_counted_and_changes_nothing(play):
+    graph = play(episodes=Episodes(1, 0, difficulty=1))
+    publisher = graph.tap.create_publisher(JointState, topics.TORQUE.name, topics.TORQUE.qos)
+    graph.spin_until(lambda: graph.simulator.ticks >= 2)
+    for stamp in (TICK // 2, 10**15):
+        publisher.publish(JointState(header=conversions.header(stamp), effort=[1.0, 1.0]))
+    graph.spin_until(lambda: graph.simulator.counts["messages of an unknown episode"] == 2)
+    assert graph.finish()[0].solved
+
+
+def test_an_image_of_wrong_size_or_encoding_is_rejected_and_counted(play):
+    graph = play(episodes=Episodes(1, 0, difficulty=1))
+    publisher = graph.tap.create_publisher(Image, topics.CAMERA.name, topics.CAMERA.qos)
+    estimator = graph.graph.nodes["estimator"]
+    graph.spin_until(lambda: graph.simulator.ticks >= 2)
+    header = conversions.header(10**12)
+    good = conversions.frame_to_msg(header, np.zeros((64, 64, 3), np.uint8))
+    good.encoding = "bgr8"
+    publisher.publish(good)
+    publisher.publish(conversions.frame_to_msg(header, np.zeros((32, 64, 3), np.uint8)))
+    graph.spin_until(lambda: estimator.counts["rejected messages"] == 2)
+    assert graph.finish()[0].solved
+
+
+def test_messages_without_an_episode_are_left_alone(play):
+    graph = play(names=["estimator"])
+    publisher = graph.tap.create_publisher(PoseStamped, topics.POSE.name, topics.POSE.qos)
+    graph.spin_until(publisher.get_subscription_count)
+    for tick in range(1, 100):
+        publisher.publish(conversions.pose_to_msg(conversions.header(tick * TICK), (0.0, 0.0, 0.0)))
+    estimator = graph.graph.nodes["estimator"]
+    graph.spin_until(lambda: estimator.dropped[topics.POSE.name] >= 50)
+
+
+def test_in_real_time_late_answers_are_counted_and_the_latest_torque_is_held(play):
+    graph = play(names=[n for n in NODES if n != "controller"], realtime=4.0, time_limit=200)
+    publisher = graph.tap.create_publisher(JointState, topics.TORQUE.name, topics.TORQUE.qos)
+    graph.spin_until(lambda: graph.said.instruction)
+    publisher.publish(JointState(header=conversions.header(min(graph.said.instruction)), effort=[0.0, 0.5]))
+    graph.spin_until(lambda: graph.simulator.ticks >= 30)
+    assert graph.simulator.counts["late answers"] >= 20
+    assert abs(graph.simulator.world.velocity[0, 2]) > 0.5
+
+
+def test_real_time_keeps_to_the_clock(play):
+    graph = play(episodes=Episodes(1, 0, difficulty=2), realtime=2.0, time_limit=80)
+    graph.spin_until(lambda: graph.simulator.ticks >= 1)
+    start, ticks = time.monotonic(), graph.simulator.ticks
+    graph.finish()
+    seconds = (graph.simulator.ticks - ticks) * TICK * 1e-9 / 2.0
+    assert time.monotonic() - start >= 0.9 * seconds
+
+
+def test_weights_are_loaded_again_while_the_graph_runs_and_bad_ones_are_refused(play, oracles, fresh_weights, tmp_path):
+    stack = Stack(oracles.choices | {"estimator": fresh_weights.choices["estimator"]})
+    graph = play(stack, time_limit=2000)
+    estimator = graph.graph.nodes["estimator"]
+    graph.spin_until(lambda: graph.simulator.ticks >= 3)
+    module = estimator.module
+
+    def set_weights(path):
+        request = SetParameters.Request(parameters=[Parameter("weights", value=str(path)).to_parameter_msg()])
+        return graph.call(SetParameters, "/estimator/set_parameters", request).results[0]
+
+    refused = set_weights(tmp_path / "missing.safetensors")
+    assert not refused.successful and "missing.safetensors" in refused.reason and estimator.module is module
+    assert set_weights(fresh_weights.choices["estimator"].weights).successful
+    assert estimator.module is not module
+    ticks = graph.simulator.ticks
+    graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
+
+
+def test_missing_weights_stop_a_node_with_a_clear_error(play, oracles, tmp_path):
+    choices = oracles.choices | {"planner": Choice("planner", weights=tmp_path / "none.safetensors")}
+    with pytest.raises(ValueError, match="none"):
+        play(Stack(choices))
