@@ -28,11 +28,10 @@ def load(path: str | Path | None = None, device: str | torch.device = "cpu") -> 
     from mujoban_rl.weights import WeightsError, load_weights, read_record
 
     weights = Path(path or SHIPPED)
-    classes = {cls.__name__: cls for cls in ARCHITECTURES.values()}
     name = read_record(weights)["class"]
-    if name not in classes:
-        raise WeightsError(f"{weights}: holds weights of {name}, expected one of {', '.join(classes)}")
-    return load_weights(classes[name], weights, device)
+    if name not in ARCHITECTURES:
+        raise WeightsError(f"{weights}: holds weights of {name}, expected one of {', '.join(ARCHITECTURES)}")
+    return load_weights(ARCHITECTURES[name], weights, device)
 
 
 __all__ = ["SHIPPED", "load"]

@@ -57,7 +57,7 @@ class BagTransitions(NamedTuple):
     def sample(self, n: int, generator: torch.Generator) -> BagTransitions:
         """Return `n` random transitions, with replacement."""
         rows = torch.randint(0, len(self.instruction), (n,), generator=generator).to(self.instruction.device)
-        return BagTransitions(*(x[rows] for x in self))
+        return BagTransitions._make(x[rows] for x in self)
 
 
 class _Pending(NamedTuple):

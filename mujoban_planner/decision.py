@@ -20,8 +20,8 @@ HISTORY = 256
 """Decisions remembered; an episode has at most 240 s, some 120 moves."""
 STATE_WEIGHT = 3.0
 """Log-probability lost per earlier try of the instruction in the same state."""
-REPEAT_WEIGHT = 1.5
-"""Log-probability lost per immediate repetition of the instruction in the same cell."""
+ARRIVAL_WEIGHT = 1.5
+"""Log-probability lost per try since the robot came to this cell."""
 CELL_WEIGHT = 0.3
 """Log-probability lost per earlier try in the same cell beyond `CELL_PATIENCE`."""
 CELL_PATIENCE = 6
@@ -50,8 +50,8 @@ class VisitCounts(NamedTuple):
     """In the same state."""
     cell: NDArray[np.int64]
     """In the same cell."""
-    repeats: NDArray[np.int64]
-    """In the same cell, in an unbroken row up to now."""
+    since_arrival: NDArray[np.int64]
+    """Since the robot came to this cell."""
 
 
 def initial_visits(batch: int) -> VisitMemory:
@@ -77,16 +77,16 @@ def count_visits(abstract_state: NDArray[np.float32], visits: VisitMemory) -> Vi
     chosen = visits.moves[:, :, None] == instructions  # Shape [M, H, A]
     here = (visits.cells == cell[:, None])[:, :, None] & chosen
     same = (visits.keys == key[:, None])[:, :, None] & here
-    # Walk back from the last decision while it is the same one in the same cell.
+    # Walk back from the last decision while the robot was in this cell.
     back = (visits.count[:, None] - 1 - np.arange(HISTORY)) % HISTORY  # Shape [M, H]
     recent = np.take_along_axis(here, back[:, :, None], axis=1)
-    repeats = np.cumprod(recent, axis=1).sum(1)
-    return VisitCounts(same.sum(1), here.sum(1), repeats)
+    staying = np.cumprod(recent.any(2), axis=1).astype(np.bool_)
+    return VisitCounts(same.sum(1), here.sum(1), (recent & staying[:, :, None]).sum(1))
 
 
 def visit_penalty(counts: VisitCounts) -> NDArray[np.float64]:
     """Return what is taken off each instruction's log-probability, [M, A]."""
-    penalty = STATE_WEIGHT * counts.state + REPEAT_WEIGHT * counts.repeats
+    penalty = STATE_WEIGHT * counts.state + ARRIVAL_WEIGHT * counts.since_arrival
     penalty = penalty + CELL_WEIGHT * np.maximum(counts.cell - CELL_PATIENCE, 0)
     # Standing still changes nothing: a second time it is worth no more than any move.
     penalty[:, Instruction.STAY] += STATE_WEIGHT * counts.cell[:, Instruction.STAY]

@@ -161,7 +161,7 @@ class ImitationTrainer:
         self._process: LessonProcess | None = None
         stream = 1000 * config.seed + self.bits
         if processes:
-            self._process = LessonProcess(stream, config.mix, config.architecture, self.played_weights, niceness=5)
+            self._process = LessonProcess(stream, config.mix, self.played_weights, niceness=5)
         else:
             self._maker = LessonMaker(stream, config.mix)
 
@@ -273,7 +273,7 @@ class ImitationTrainer:
             parts.append(self.corrections.draw(corrections, self.rng))
         batch = make_batch(concatenate(parts), self.rng.integers(0, SYMMETRIES, config.batch_size)).to(self.device)
         order = torch.randperm(config.batch_size, generator=self.generator).to(self.device)
-        batch = Batch(*(x[order] for x in batch))
+        batch = Batch._make(x[order] for x in batch)
         batch = batch._replace(state=make_uncertain(batch.state, config.noise, self.generator))
         for group in self.optimiser.param_groups:
             group["lr"] = config.learning_rate * self._schedule()
@@ -288,7 +288,8 @@ class ImitationTrainer:
         self.samples += config.batch_size
         decay = min(config.ema, (1 + self.steps) / (10 + self.steps))
         with torch.no_grad():
-            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - decay)
+            for mean, parameter in zip(self.average.parameters(), self.network.parameters(), strict=True):
+                mean.lerp_(parameter, 1 - decay)
         for name, value in stats.items():
             sums[name] = sums.get(name, 0.0) + float(value)
         sums["n"] = sums.get("n", 0.0) + 1.0

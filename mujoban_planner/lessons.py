@@ -18,12 +18,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mujoban_planner import load
 from mujoban_planner.boards import take_levels
-from mujoban_planner.planner import ARCHITECTURES, LearnedPlanner
+from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import Game, play
 from mujoban_planner.samples import Samples, concatenate
 from mujoban_planner.teacher import Teacher, label_deadly, possible_pushes
-from mujoban_rl.weights import WeightsError, load_weights
+from mujoban_rl.weights import WeightsError
 from mujoban_sim.generator import TRAIN_SEEDS, generate_batch
 from mujoban_sim.levels import LevelBatch
 from mujoban_sim.solver import Status
@@ -130,13 +131,13 @@ def _states(levels: LevelBatch, game: Game, rows: NDArray[np.int64], times: NDAr
 class LessonProcess:
     """A `LessonMaker` in a process of its own, which plays with the newest weights that the trainer has written."""
 
-    def __init__(self, stream: int, mix: dict[int, float], architecture: str, weights: Path, niceness: int) -> None:
+    def __init__(self, stream: int, mix: dict[int, float], weights: Path, niceness: int) -> None:
         """Start the process; corrections come once `weights` exists."""
         context = get_context("spawn")
         self._stop: Event = context.Event()
         self.demonstrations: Queue[Samples] = context.Queue(maxsize=2)
         self.corrections: Queue[Samples] = context.Queue(maxsize=2)
-        arguments = (stream, mix, architecture, weights, niceness, self._stop, self.demonstrations, self.corrections)
+        arguments = (stream, mix, weights, niceness, self._stop, self.demonstrations, self.corrections)
         self._process = context.Process(target=_make_lessons, args=arguments, daemon=True)
         self._process.start()
 
@@ -167,7 +168,6 @@ class LessonProcess:
 def _make_lessons(
     stream: int,
     mix: dict[int, float],
-    architecture: str,
     weights: Path,
     niceness: int,
     stop: Event,
@@ -186,7 +186,7 @@ def _make_lessons(
         elif not corrections.full() and weights.exists():
             if (found := weights.stat().st_mtime) != version:
                 try:
-                    planner, version = load_weights(ARCHITECTURES[architecture], weights), found
+                    planner, version = load(weights), found
                 except WeightsError:  # caught between the two files of a newer version: try again
                     continue
             if planner is not None:

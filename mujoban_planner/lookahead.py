@@ -59,7 +59,7 @@ class LookAheadPlanner(Planner):
             self._search(abstract_state[rows], rows, plan, wait)
         planned = plan[np.arange(len(plan)), cursor]
         counts = count_visits(abstract_state, visits)
-        stuck = counts.repeats[np.arange(len(plan)), planned] >= 2
+        stuck = counts.since_arrival[np.arange(len(plan)), planned] >= 2
         alone = (planned == 0) | stuck
         decision = planned.copy()
         if alone.any():

@@ -332,9 +332,9 @@ class RecurrentPlanner(LearnedPlanner):
 
 
 def _bias(layer: nn.Conv2d) -> nn.Parameter:
-    assert layer.bias is not None
+    assert isinstance(layer.bias, nn.Parameter)
     return layer.bias
 
 
-ARCHITECTURES: dict[str, type[LearnedPlanner]] = {"residual": ResidualPlanner, "recurrent": RecurrentPlanner}
-"""Architecture by the name that the trainer's configuration uses."""
+ARCHITECTURES: dict[str, type[LearnedPlanner]] = {cls.__name__: cls for cls in (ResidualPlanner, RecurrentPlanner)}
+"""Architecture by the name of its class, as in the records of weights."""

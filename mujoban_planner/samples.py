@@ -52,7 +52,7 @@ class Samples(NamedTuple):
 
     def take(self, rows: NDArray[Any]) -> Samples:
         """Return the given rows, by index or mask."""
-        return Samples(*(column[rows] for column in self))
+        return Samples._make(column[rows] for column in self)
 
 
 class Batch(NamedTuple):
@@ -75,7 +75,7 @@ class Batch(NamedTuple):
 
     def to(self, device: torch.device | str) -> Batch:
         """Return the batch on a device."""
-        return Batch(*(x.to(device, non_blocking=True) for x in self))
+        return Batch._make(x.to(device, non_blocking=True) for x in self)
 
 
 def unlabelled(boards: BitBoards) -> Samples:
@@ -88,7 +88,7 @@ def unlabelled(boards: BitBoards) -> Samples:
 
 def concatenate(parts: list[Samples]) -> Samples:
     """Return the rows of all parts."""
-    return Samples(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return Samples._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
 
 
 class SampleBuffer:
@@ -99,8 +99,8 @@ class SampleBuffer:
         self.capacity = capacity
         self.size = 0
         self.added = 0
-        boards = [np.zeros(capacity, np.uint64) for _ in range(3)]
-        self.storage = unlabelled(BitBoards(*boards, np.zeros(capacity, np.uint8)))
+        none = np.zeros(capacity, np.uint64)
+        self.storage = unlabelled(BitBoards(none, none.copy(), none.copy(), np.zeros(capacity, np.uint8)))
 
     def add(self, samples: Samples) -> None:
         """Append samples.
@@ -129,7 +129,7 @@ def make_batch(samples: Samples, symmetry: NDArray[np.int64]) -> Batch:
     masks = np.empty((3, n, len(Instruction)), np.bool_)
     stacked = np.stack([samples.right, samples.dead_known, samples.dead])
     _fill_labels(samples.plan, stacked, symmetry, _SOURCES, _INSTRUCTION_MAPS, plan, masks)
-    right, dead_known, dead = torch.from_numpy(masks)
+    right, dead_known, dead = torch.from_numpy(masks).unbind()
     return Batch(
         state_tensor(samples.boards, symmetry),
         right,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from mujoban_planner.planner import ARCHITECTURES, LearnedPlanner
+from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner, ResidualPlanner
 from mujoban_planner.play import play
 from mujoban_sim.generator import TEST_SEEDS, generate_batch
 from mujoban_sim.levels import LevelBatch
@@ -34,9 +34,9 @@ class NetworkConfig:
 
     def build(self) -> LearnedPlanner:
         """Return a new network."""
-        recurrent = {"depth": self.depth, "repeats": self.repeats}
-        shape = {"blocks": self.blocks} if self.architecture == "residual" else recurrent
-        return ARCHITECTURES[self.architecture](channels=self.channels, propagation=self.propagation, **shape)
+        if self.architecture == "recurrent":
+            return RecurrentPlanner(self.channels, self.depth, self.repeats, self.propagation)
+        return ResidualPlanner(self.channels, self.blocks, self.propagation)
 
 
 def validation_levels(difficulty: int, n: int) -> LevelBatch:

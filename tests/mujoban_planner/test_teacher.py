@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+
 from mujoban_planner.boards import abstract_states, bit_boards, likeliest_boards, state_tensor, take_levels
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.planner import ResidualPlanner, input_planes
@@ -8,7 +9,6 @@ from mujoban_planner.propagation import legal_pushes, propagate, walk_to_push
 from mujoban_planner.samples import SampleBuffer, make_batch, unlabelled
 from mujoban_planner.symmetry import SYMMETRIES, transform_planes
 from mujoban_planner.teacher import DISCOUNT, Teacher, label_deadly
-
 from mujoban_sim import rules
 from mujoban_sim.generator import generate_batch
 from mujoban_sim.levels import Level, stack_levels

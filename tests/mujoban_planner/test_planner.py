@@ -1,0 +1,177 @@
+import numpy as np
+import pytest
+import torch
+
+import mujoban_planner
+from mujoban_planner.boards import abstract_states
+from mujoban_planner.decision import HISTORY
+from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner, ResidualPlanner
+from mujoban_planner.play import play
+from mujoban_planner.symmetry import SYMMETRIES, instruction_map, instruction_permutation, transform_planes
+from mujoban_sim.generator import generate_batch
+from mujoban_sim.grid import GRID_SIZE, Instruction
+from mujoban_sim.interfaces import take_rows
+
+
+class Stubborn(LearnedPlanner):
+    """Wants to go north whatever happens."""
+
+    def __init__(self, preference=(0.0, 9.0, 3.0, 2.0, 1.0)):
+        super().__init__(propagation=False)
+        self.preference = np.array(preference)
+
+    config = heads = property(lambda self: {})
+
+    def features(self, planes):
+        raise NotImplementedError
+
+    def scores(self, abstract_state):
+        return np.tile(self.preference - np.log(np.exp(self.preference).sum()), (len(abstract_state), 1))
+
+
+def _states(n=4, difficulty=5, seed=0):
+    return abstract_states(generate_batch(difficulty, range(seed, seed + n)))
+
+
+@pytest.mark.parametrize("planner", [ResidualPlanner(16, 2), RecurrentPlanner(8, 2), RecurrentPlanner(8, 1, 1, True)])
+def test_decisions_do_not_depend_on_the_batch(planner):
+    planner.eval()
+    states = _states(6)
+    memory = planner.initial_state(np.arange(6)).memory
+    together, _ = planner.decide(states, memory)
+    alone = [planner.decide(states[i : i + 1], take_rows(memory, np.array([i])))[0][0] for i in range(6)]
+    assert together.tolist() == alone
+
+
+@pytest.mark.parametrize("planner", [ResidualPlanner(16, 2), RecurrentPlanner(8, 2, 2)])
+def test_heads_have_the_shapes_of_the_paper_and_gradients_reach_every_weight(planner):
+    output = planner(torch.from_numpy(_states(3)))
+    assert output.policy.shape == output.q.shape == output.dead.shape == (3, len(Instruction))
+    sum(x.square().mean() for x in output).backward()
+    for name, parameter in planner.named_parameters():
+        assert parameter.grad is not None, name
+
+
+def test_recurrent_core_starts_from_a_trainable_state_and_thinks_longer_on_demand():
+    planner = RecurrentPlanner(8, 2, 2).eval()
+    states = torch.from_numpy(_states(2))
+    once = planner(states).policy
+    planner.thinking = 3
+    assert not torch.allclose(once, planner(states).policy)
+    planner.thinking = 1
+    with torch.no_grad():
+        planner.initial += 0.5
+    assert not torch.allclose(once, planner(states).policy)
+
+
+def test_a_move_that_does_nothing_is_not_repeated_for_ever():
+    planner, state = Stubborn(), _states(1)
+    memory = planner.initial_state(np.zeros(1, np.int64)).memory
+    tried = []
+    for _ in range(12):
+        decision, memory = planner.decide(state, memory)
+        tried.append(int(decision[0]))
+    assert len(set(tried[:8])) >= 3
+    assert max(len(run) for run in "".join("N" if t == 1 else "." for t in tried).split(".")) <= 4
+
+
+def test_flickering_estimates_do_not_hide_a_repetition():
+    planner, rng = Stubborn(), np.random.default_rng(0)
+    state = _states(1)
+    memory = planner.initial_state(np.zeros(1, np.int64)).memory
+    tried = []
+    for _ in range(30):
+        flicker = state.copy()
+        flicker[0, rng.integers(1, 9), rng.integers(1, 9), 3] = 0.9
+        decision, memory = planner.decide(flicker, memory)
+        tried.append(int(decision[0]))
+    longest = max(len(run) for run in "".join("N" if t == 1 else "." for t in tried).split("."))
+    assert longest <= 8 and len(set(tried)) >= 3
+
+
+def test_cycles_end():
+    # East and west in turn on an empty corridor: the state recurs, so other instructions get their turn.
+    planner = Stubborn((0.0, 0.1, 5.0, 0.1, 4.9))
+    west, east = _states(1), _states(1)
+    for state, column in ((west, 4), (east, 5)):
+        state[..., 2] = 0.0
+        state[0, 5, column, 2] = 1.0
+    memory = planner.initial_state(np.zeros(1, np.int64)).memory
+    at, tried = 0, []
+    for _ in range(30):
+        decision, memory = planner.decide((west, east)[at], memory)
+        tried.append(int(decision[0]))
+        at = {2: 1, 4: 0}.get(tried[-1], at)
+    assert {Instruction.NORTH, Instruction.SOUTH} & set(tried)
+
+
+def test_history_longer_than_the_memory_is_forgotten_gracefully():
+    planner, state = Stubborn(), _states(1)
+    memory = planner.initial_state(np.zeros(1, np.int64)).memory
+    for _ in range(HISTORY + 20):
+        decision, memory = planner.decide(state, memory)
+    assert 0 <= decision[0] < len(Instruction)
+
+
+def test_soft_estimates_and_unseen_cells_give_decisions():
+    planner = ResidualPlanner(16, 2).eval()
+    rng = np.random.default_rng(0)
+    states = rng.random((8, GRID_SIZE, GRID_SIZE, 4)).astype(np.float32)
+    states[0] = 0.0
+    decision, _ = planner.decide(states, planner.initial_state(np.arange(8)).memory)
+    assert ((decision >= 0) & (decision < len(Instruction))).all()
+
+
+def test_bad_abstract_states_are_named():
+    planner = ResidualPlanner(8, 1).eval()
+    memory = planner.initial_state(np.zeros(1, np.int64)).memory
+    with pytest.raises(ValueError, match="shape"):
+        planner.decide(np.zeros((1, 8, 8, 4), np.float32), memory)
+    with pytest.raises(ValueError, match="finite"):
+        planner.decide(np.full((1, GRID_SIZE, GRID_SIZE, 4), np.nan, np.float32), memory)
+
+
+def test_instruction_is_held_until_termination():
+    planner = ResidualPlanner(8, 1).eval()
+    state = planner.initial_state(np.arange(2))
+    first, state = planner.step(_states(2), np.zeros(2, bool), state)
+    held, state = planner.step(_states(2, seed=9), np.zeros(2, bool), state)
+    assert np.array_equal(first, held) and state.sequence.tolist() == [1, 1]
+    _, state = planner.step(_states(2, seed=9), np.array([True, False]), state)
+    assert state.sequence.tolist() == [2, 1]
+
+
+def test_symmetric_views_bring_instructions_back():
+    states = torch.from_numpy(_states(1))
+    where = torch.argwhere(states[0, ..., 2])[0]
+    for symmetry in range(SYMMETRIES):
+        names = instruction_map(symmetry)
+        for a, offset in enumerate([(0, 0), (-1, 0), (0, 1), (1, 0), (0, -1)]):
+            moved = states.clone()
+            moved[..., 2] = 0
+            moved[0, where[0] + offset[0], where[1] + offset[1], 2] = 1
+            turned = torch.argwhere(transform_planes(moved, symmetry)[0, ..., 2])[0]
+            origin = torch.argwhere(transform_planes(states, symmetry)[0, ..., 2])[0]
+            step = [(0, 0), (-1, 0), (0, 1), (1, 0), (0, -1)][names[a]]
+            assert (turned - origin).tolist() == list(step)
+        values = torch.arange(5.0)[None]
+        seen = torch.zeros(1, 5).scatter_(1, torch.tensor([names]), values)
+        assert torch.equal(seen.gather(1, instruction_permutation(symmetry)[None]), values)
+
+
+def test_shipped_planner_solves_easy_levels():
+    planner = mujoban_planner.load()
+    torch.set_num_threads(1)
+    game = play(planner, generate_batch(1, range(1000, 1100)))
+    assert game.solved.sum() >= 98
+
+
+def test_soft_views_average_to_a_symmetric_policy():
+    planner = ResidualPlanner(16, 2).eval()
+    planner.thinking = 8
+    states = torch.from_numpy(_states(2))
+    with torch.inference_mode():
+        upright, _ = planner.evaluate(states)
+        turned, _ = planner.evaluate(transform_planes(states, 3))
+    order = instruction_permutation(3)
+    assert torch.allclose(upright, turned[:, order], atol=1e-4)
