@@ -97,13 +97,22 @@ class Stack:
         return {role: choice.identity() for role, choice in self.choices.items()}
 
 
+def positive(text: str) -> int:
+    """Read an integer from 1 on."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text} is too small: expected at least 1")
+    return number
+
+
 def add_episode_options(parser: argparse.ArgumentParser, *, episodes: int | None = None) -> None:
     """Add the options that say which episodes are played."""
     parser.add_argument(
         "--difficulty", type=int, choices=sorted(DIFFICULTIES), default=max(DIFFICULTIES), help="of generated levels"
     )
-    parser.add_argument("--episodes", type=int, default=episodes, help="number of episodes")
+    parser.add_argument("--episodes", type=positive, default=episodes, help="number of episodes")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode; episode i has seed + i")
+    parser.add_argument("--time-limit", type=positive, metavar="STEPS", help="of an episode; the body's by default")
     parser.add_argument("--levels", type=Path, metavar="FILE", help="play the levels of a Boxoban text file instead")
 
 

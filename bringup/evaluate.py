@@ -17,6 +17,7 @@ from bringup.command import (
     add_module_options,
     episodes_from,
     import_from_here,
+    positive,
     run_command,
     stack_from,
 )
@@ -30,7 +31,13 @@ PROG = "evaluate.py"
 
 
 def evaluate(
-    policy: SensePlanAct, episodes: Episodes, *, batch: int = 64, threads: int = 1, progress: bool = False
+    policy: SensePlanAct,
+    episodes: Episodes,
+    *,
+    batch: int = 64,
+    time_limit: int | None = None,
+    threads: int = 1,
+    progress: bool = False,
 ) -> list[EpisodeResult]:
     """Play the episodes in one batched world and return their outcomes.
 
@@ -38,10 +45,13 @@ def evaluate(
         policy: The four modules.
         episodes: Levels and seeds.
         batch: Rows of the world.
+        time_limit: Steps of an episode; None means that of the body.
         threads: Threads of the physics.
         progress: Whether to show a progress bar on stderr.
     """
-    world = World(min(batch, len(episodes)), max_boxes=episodes.max_boxes, threads=threads)
+    world = World(
+        min(batch, len(episodes)), max_boxes=episodes.max_boxes, time_limit=time_limit, threads=threads
+    )
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not progress) as bar:
         task = bar.add_task("solved", total=len(episodes))
@@ -60,24 +70,29 @@ def main() -> int:
     parser = Parser(PROG, description="Evaluate the stack on many levels in one vectorised rollout.")
     add_episode_options(parser, episodes=256)
     add_module_options(parser)
-    parser.add_argument("--batch", type=int, default=64, help="episodes that run at the same time")
-    parser.add_argument("--threads", type=int, default=1, help="threads of physics and networks")
+    parser.add_argument("--batch", type=positive, default=64, help="episodes that run at the same time")
+    parser.add_argument("--threads", type=positive, default=1, help="threads of physics and networks")
     parser.add_argument("--graph", action="store_true", help="play through the ROS graph instead")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there instead of printing it")
     arguments = parser.parse_args()
     import_from_here()
     episodes, stack = episodes_from(arguments), stack_from(arguments)
     if arguments.graph:
-        from bringup.stack import play
+        from bringup.stack import PlayOptions, play
 
-        outcome = play(stack, episodes)
+        outcome = play(stack, episodes, PlayOptions(time_limit=arguments.time_limit))
         content = report(outcome.results, stack.identities(), ticks_per_second=outcome.ticks_per_second)
     else:
         import torch
 
         torch.set_num_threads(arguments.threads)
         results = evaluate(
-            stack.policy(), episodes, batch=arguments.batch, threads=arguments.threads, progress=True
+            stack.policy(),
+            episodes,
+            batch=arguments.batch,
+            time_limit=arguments.time_limit,
+            threads=arguments.threads,
+            progress=True,
         )
         content = report(results, stack.identities())
     if arguments.json is None:

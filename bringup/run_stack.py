@@ -15,6 +15,7 @@ from bringup.command import (
     add_module_options,
     episodes_from,
     import_from_here,
+    positive,
     run_command,
     stack_from,
 )
@@ -38,17 +39,10 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--processes", action="store_true", help="run each node in a process of its own")
     parser.add_argument("--headless", action="store_true", help="show no live view")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record all topics into a bag")
-    parser.add_argument("--episodes-per-file", type=_positive, default=32, metavar="N", help="of the bag")
+    parser.add_argument("--episodes-per-file", type=positive, default=32, metavar="N", help="of the bag")
     parser.add_argument("--video", type=Path, metavar="FILE", help="write an .mp4 of the robot's view and from above")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there")
     return parser.parse_args(arguments)
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text} is too small: expected at least 1")
-    return number
 
 
 def _speed(text: str) -> float:
@@ -67,6 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console()
     play_options = PlayOptions(
         realtime=options.realtime,
+        time_limit=options.time_limit,
         processes=options.processes,
         record=options.record,
         episodes_per_file=options.episodes_per_file,

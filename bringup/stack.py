@@ -35,6 +35,8 @@ class PlayOptions:
 
     realtime: float = 0.0
     """Simulated seconds per second; 0 is lockstep."""
+    time_limit: int | None = None
+    """Steps of an episode; None means that of the body."""
     processes: bool = False
     """One process for each node."""
     record: Path | None = None
@@ -82,6 +84,7 @@ def play(
         stack,
         episodes,
         realtime=options.realtime,
+        time_limit=options.time_limit or 0,
         await_recorder=options.record is not None,
         top_camera_size=FRAME_SIZE if options.video is None else EDGE,
     )

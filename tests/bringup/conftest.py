@@ -104,7 +104,7 @@ class Play:
 
 
 @pytest.fixture
-def play(ros):
+def play_graph(ros):
     """Return a function that starts a graph; it is stopped after the test."""
     running = []
 

@@ -26,9 +26,9 @@ def rolled_out(stack, episodes, time_limit):
     ]
 
 
-def assert_equal_runs(play, stack, episodes, time_limit):
+def assert_equal_runs(play_graph, stack, episodes, time_limit):
     expected = rolled_out(stack, episodes, time_limit)
-    graph = play(stack, episodes, time_limit=time_limit)
+    graph = play_graph(stack, episodes, time_limit=time_limit)
     graph.finish()
     said, stamp = graph.said, 0
     for instruction, torque, reward, ended in expected:
@@ -40,24 +40,24 @@ def assert_equal_runs(play, stack, episodes, time_limit):
     assert len(said.torque) == len(expected)
 
 
-def test_oracles_do_the_same_in_the_graph_as_in_process(play, oracles):
-    assert_equal_runs(play, oracles, Episodes(2, 3, difficulty=2), 400)
+def test_oracles_do_the_same_in_the_graph_as_in_process(play_graph, oracles):
+    assert_equal_runs(play_graph, oracles, Episodes(2, 3, difficulty=2), 400)
 
 
-def test_networks_do_the_same_in_the_graph_as_in_process(play, fresh_weights):
-    assert_equal_runs(play, fresh_weights, Episodes(2, 5, difficulty=3), 40)
+def test_networks_do_the_same_in_the_graph_as_in_process(play_graph, fresh_weights):
+    assert_equal_runs(play_graph, fresh_weights, Episodes(2, 5, difficulty=3), 40)
 
 
 @pytest.mark.parametrize("role", ["estimator", "termination", "controller"])
-def test_one_network_among_oracles_does_the_same(play, oracles, fresh_weights, role):
+def test_one_network_among_oracles_does_the_same(play_graph, oracles, fresh_weights, role):
     stack = Stack(oracles.choices | {role: fresh_weights.choices[role]})
-    assert_equal_runs(play, stack, Episodes(1, 7, difficulty=1), 25)
+    assert_equal_runs(play_graph, stack, Episodes(1, 7, difficulty=1), 25)
 
 
-def test_two_runs_of_the_graph_are_equal(play, fresh_weights):
+def test_two_runs_of_the_graph_are_equal(play_graph, fresh_weights):
     runs = []
     for _ in range(2):
-        graph = play(fresh_weights, Episodes(1, 9, difficulty=2), time_limit=20)
+        graph = play_graph(fresh_weights, Episodes(1, 9, difficulty=2), time_limit=20)
         graph.finish()
         runs.append((graph.said.instruction, graph.said.torque, graph.said.reward))
         graph.__exit__(None, None, None)
@@ -65,7 +65,7 @@ def test_two_runs_of_the_graph_are_equal(play, fresh_weights):
     assert np.isfinite([t for torque in runs[0][1].values() for t in torque]).all()
 
 
-def test_a_class_of_ones_own_plays_a_role(play, oracles):
+def test_a_class_of_ones_own_plays_a_role(play_graph, oracles):
     stack = Stack(oracles.choices | {"planner": Choice("planner", "mujoban_sim.oracles:OraclePlanner")})
-    (result,) = play(stack, Episodes(1, 0, difficulty=1)).finish()
+    (result,) = play_graph(stack, Episodes(1, 0, difficulty=1)).finish()
     assert result.solved

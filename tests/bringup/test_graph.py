@@ -23,8 +23,8 @@ MODULES = ("estimator", "termination", "planner", "controller")
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_an_episode_ends_though_a_module_is_killed_and_started_again(play, name):
-    graph = play()
+def test_an_episode_ends_though_a_module_is_killed_and_started_again(play_graph, name):
+    graph = play_graph()
     graph.spin_until(lambda: graph.simulator.ticks >= 30)
     graph.graph.stop(name)
     ticks = graph.simulator.ticks
@@ -35,8 +35,8 @@ def test_an_episode_ends_though_a_module_is_killed_and_started_again(play, name)
     assert result.solved
 
 
-def test_an_episode_ends_though_all_modules_are_killed_and_started_again(play):
-    graph = play()
+def test_an_episode_ends_though_all_modules_are_killed_and_started_again(play_graph):
+    graph = play_graph()
     graph.spin_until(lambda: graph.simulator.ticks >= 30)
     for name in MODULES:
         graph.graph.stop(name)
@@ -46,8 +46,8 @@ def test_an_episode_ends_though_all_modules_are_killed_and_started_again(play):
     assert result.solved
 
 
-def test_a_simulator_that_is_started_again_plays_the_same_episode_at_later_stamps(play, tmp_path):
-    graph = play(episodes=Episodes(2, 0, difficulty=1), progress_file=str(tmp_path / "progress.json"))
+def test_a_simulator_that_is_started_again_plays_the_same_episode_at_later_stamps(play_graph, tmp_path):
+    graph = play_graph(episodes=Episodes(2, 0, difficulty=1), progress_file=str(tmp_path / "progress.json"))
     graph.spin_until(lambda: len(graph.monitor.results) == 1 and graph.monitor.episode.step == 10)
     before = graph.monitor.episode
     graph.graph.stop("simulator")
@@ -81,8 +81,8 @@ def test_processes_that_are_killed_are_started_again(ros, oracles):
         assert monitor.results[0].solved and monitor.results[0].seed == 0
 
 
-def test_pause_holds_the_world_and_step_advances_it_by_one_tick(play):
-    graph = play()
+def test_pause_holds_the_world_and_step_advances_it_by_one_tick(play_graph):
+    graph = play_graph()
     graph.spin_until(lambda: graph.simulator.ticks >= 5)
     assert graph.call(SetBool, "/pause", SetBool.Request(data=True)).success
     held = graph.simulator.ticks
@@ -98,8 +98,8 @@ def test_pause_holds_the_world_and_step_advances_it_by_one_tick(play):
     assert graph.finish()[0].solved
 
 
-def test_reset_starts_the_same_episode_again(play):
-    graph = play()
+def test_reset_starts_the_same_episode_again(play_graph):
+    graph = play_graph()
     graph.spin_until(lambda: graph.simulator.ticks >= 20)
     assert graph.call(Trigger, "/reset", Trigger.Request()).success
     (result,) = graph.finish()
@@ -110,8 +110,8 @@ def test_reset_starts_the_same_episode_again(play):
 
 
 @pytest.mark.parametrize("effort", [[float("nan"), 0.0], [0.0, 1.5], [0.0]])
-def test_a_bad_torque_is_rejected_counted_and_zero_is_held(play, effort):
-    graph = play(names=[name for name in NODES if name != "controller"])
+def test_a_bad_torque_is_rejected_counted_and_zero_is_held(play_graph, effort):
+    graph = play_graph(names=[name for name in NODES if name != "controller"])
     publisher = graph.tap.create_publisher(JointState, topics.TORQUE.name, topics.TORQUE.qos)
     graph.spin_until(lambda: graph.said.instruction)
     (stamp,) = graph.said.instruction
@@ -121,8 +121,8 @@ def test_a_bad_torque_is_rejected_counted_and_zero_is_held(play, effort):
     assert np.abs(graph.simulator.world.velocity).max() < 0.05
 
 
-def test_a_torque_of_an_unknown_episode_is_counted_and_changes_nothing(play):
-    graph = play(episodes=Episodes(1, 0, difficulty=1))
+def test_a_torque_of_an_unknown_episode_is_counted_and_changes_nothing(play_graph):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
     publisher = graph.tap.create_publisher(JointState, topics.TORQUE.name, topics.TORQUE.qos)
     graph.spin_until(lambda: graph.simulator.ticks >= 2)
     for stamp in (TICK // 2, 10**15):
@@ -131,8 +131,8 @@ def test_a_torque_of_an_unknown_episode_is_counted_and_changes_nothing(play):
     assert graph.finish()[0].solved
 
 
-def test_an_image_of_wrong_size_or_encoding_is_rejected_and_counted(play):
-    graph = play(episodes=Episodes(1, 0, difficulty=1))
+def test_an_image_of_wrong_size_or_encoding_is_rejected_and_counted(play_graph):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
     publisher = graph.tap.create_publisher(Image, topics.CAMERA.name, topics.CAMERA.qos)
     estimator = graph.graph.nodes["estimator"]
     graph.spin_until(lambda: graph.simulator.ticks >= 2)
@@ -145,8 +145,8 @@ def test_an_image_of_wrong_size_or_encoding_is_rejected_and_counted(play):
     assert graph.finish()[0].solved
 
 
-def test_messages_without_an_episode_are_left_alone(play):
-    graph = play(names=["estimator"])
+def test_messages_without_an_episode_are_left_alone(play_graph):
+    graph = play_graph(names=["estimator"])
     publisher = graph.tap.create_publisher(PoseStamped, topics.POSE.name, topics.POSE.qos)
     graph.spin_until(publisher.get_subscription_count)
     for tick in range(1, 100):
@@ -155,8 +155,8 @@ def test_messages_without_an_episode_are_left_alone(play):
     graph.spin_until(lambda: estimator.dropped[topics.POSE.name] >= 50)
 
 
-def test_in_real_time_late_answers_are_counted_and_the_latest_torque_is_held(play):
-    graph = play(names=[n for n in NODES if n != "controller"], realtime=4.0, time_limit=200)
+def test_in_real_time_late_answers_are_counted_and_the_latest_torque_is_held(play_graph):
+    graph = play_graph(names=[n for n in NODES if n != "controller"], realtime=4.0, time_limit=200)
     publisher = graph.tap.create_publisher(JointState, topics.TORQUE.name, topics.TORQUE.qos)
     graph.spin_until(lambda: graph.said.instruction)
     publisher.publish(JointState(header=conversions.header(min(graph.said.instruction)), effort=[0.0, 0.5]))
@@ -165,8 +165,8 @@ def test_in_real_time_late_answers_are_counted_and_the_latest_torque_is_held(pla
     assert abs(graph.simulator.world.velocity[0, 2]) > 0.5
 
 
-def test_real_time_keeps_to_the_clock(play):
-    graph = play(episodes=Episodes(1, 0, difficulty=2), realtime=2.0, time_limit=80)
+def test_real_time_keeps_to_the_clock(play_graph):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=2), realtime=2.0, time_limit=80)
     graph.spin_until(lambda: graph.simulator.ticks >= 1)
     start, ticks = time.monotonic(), graph.simulator.ticks
     graph.finish()
@@ -174,9 +174,9 @@ def test_real_time_keeps_to_the_clock(play):
     assert time.monotonic() - start >= 0.9 * seconds
 
 
-def test_weights_are_loaded_again_while_the_graph_runs_and_bad_ones_are_refused(play, oracles, fresh_weights, tmp_path):
+def test_weights_are_loaded_while_the_graph_runs_and_bad_ones_are_refused(play_graph, oracles, fresh_weights, tmp_path):
     stack = Stack(oracles.choices | {"estimator": fresh_weights.choices["estimator"]})
-    graph = play(stack, time_limit=2000)
+    graph = play_graph(stack, time_limit=2000)
     estimator = graph.graph.nodes["estimator"]
     graph.spin_until(lambda: graph.simulator.ticks >= 3)
     module = estimator.module
@@ -193,7 +193,7 @@ def test_weights_are_loaded_again_while_the_graph_runs_and_bad_ones_are_refused(
     graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
 
 
-def test_missing_weights_stop_a_node_with_a_clear_error(play, oracles, tmp_path):
+def test_missing_weights_stop_a_node_with_a_clear_error(play_graph, oracles, tmp_path):
     choices = oracles.choices | {"planner": Choice("planner", weights=tmp_path / "none.safetensors")}
     with pytest.raises(ValueError, match="none"):
-        play(Stack(choices))
+        play_graph(Stack(choices))
