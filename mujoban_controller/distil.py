@@ -52,6 +52,8 @@ class DistilConfig:
     clip: float = 5.0
     goal_weight: float = 0.5
     kind_weight: float = 0.05
+    jitter: float = 0.25
+    """Largest relative change of each colour's brightness, drawn anew for each sequence."""
     average: float = 0.998
     """Decay of the weights' moving average, which is what ships."""
 
@@ -90,6 +92,12 @@ def imitation_loss(
         "error/torque": (mean - label).abs().mean(),
     }
     return loss, {k: v.detach() for k, v in stats.items()}
+
+
+def jitter_colours(frame: Tensor, amount: float) -> Tensor:
+    """Return frames [M, T, H, W, 3] with each colour of each sequence brighter or darker, as floats up to 255."""
+    gain = 1.0 + amount * (2.0 * torch.rand(len(frame), 1, 1, 1, 3, device=frame.device) - 1.0)
+    return (frame * gain).clamp_(max=255.0)
 
 
 class Collector:
@@ -168,7 +176,7 @@ class Distiller:
         for group in self.optimiser.param_groups:
             group["lr"] = config.learning_rate * self._schedule()
         output = student(
-            batch["frame"], batch["proprio"], batch["instruction"], batch["terminated"],
+            jitter_colours(batch["frame"], config.jitter), batch["proprio"], batch["instruction"], batch["terminated"],
             (batch["h"], batch["c"]), batch["first"],
         )  # fmt: skip
         loss, stats = imitation_loss(output, self.head, batch, config)

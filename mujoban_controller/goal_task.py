@@ -10,6 +10,7 @@ Shapes: B robots, M selected rows, P proprioceptive values, U actuators.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -49,8 +50,9 @@ class GoalTaskConfig:
     """Share of episodes that follow the planner."""
     astray: float = 0.06
     """Chance that a random instruction takes the place of a planned one."""
-    horizon: int = 600
-    """Steps of an episode of random instructions; planned ones go on until the level is solved."""
+    horizon: float = 200.0
+    """Mean steps of an episode, exponentially distributed. Short ones show more levels and appearances, without
+    which a camera policy knows the 64 warehouses that it is in by heart; `inf` goes on until the level is solved."""
     patience: int = 3
     """Instructions that fail in a row before the episode is given up, since a jammed box stays jammed."""
     misaligned: float = 0.5
@@ -69,6 +71,8 @@ class GoalTaskConfig:
 
     def __post_init__(self) -> None:
         """Reject settings that contradict each other."""
+        if not self.horizon > 0:
+            raise ValueError(f"horizon {self.horizon}: expected a positive number of steps")
         if self.difficulty not in DIFFICULTIES:
             raise ValueError(f"difficulty {self.difficulty}: expected one of {sorted(DIFFICULTIES)}")
         if not 0.0 < self.tolerance <= COMPLETION_TOLERANCE:
@@ -84,6 +88,7 @@ def judging_config(batch: int, body: str = "ball", difficulty: int = 5) -> GoalT
         tolerance=COMPLETION_TOLERANCE,
         planned=1.0,
         astray=0.0,
+        horizon=math.inf,
         misaligned=0.0,
         patience=12,
         terminations=EXACT,
@@ -175,6 +180,7 @@ class GoalTask:
         self._start_boxes = self.world.box_cell.copy()
         self._failures = np.zeros(b, np.int64)
         self._completed = np.zeros(b, np.bool_)
+        self._horizon = np.full(b, math.inf)
         self._begin_episodes(np.arange(b))
         self._issue(np.arange(b))
 
@@ -216,7 +222,7 @@ class GoalTask:
         judged = np.flatnonzero(ended & (completed | failed))
         outcomes = [self._outcome(b, bool(completed[b])) for b in judged.tolist()]
         self._failures = np.where(failed, self._failures + 1, np.where(ended, 0, self._failures))
-        over = world.done | (ended & ~self.planned & (world.steps >= config.horizon))
+        over = world.done | (ended & (world.steps >= self._horizon))
         over |= self._failures >= config.patience
         self._completed = completed & ~over
         episodes = [self._episode_end(b) for b in np.flatnonzero(over).tolist()]
@@ -265,6 +271,8 @@ class GoalTask:
         config, rng = self.config, self._rng
         self.world.reset(rows, [self._episodes() for _ in rows])
         self._failures[rows] = 0
+        if config.horizon < math.inf:
+            self._horizon[rows] = rng.exponential(config.horizon, len(rows))
         self.planned[rows] = rng.random(len(rows)) < config.planned
         if self._memory:
             self._memory = put_rows(self._memory, rows, self._planner.initial_memory(len(rows)))

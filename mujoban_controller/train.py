@@ -8,7 +8,7 @@ scratch or from distilled weights (`--initial`). Give the directory again to res
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,7 +28,10 @@ from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
 from mujoban_rl.weights import digest, load_weights, provenance, save_weights
 from mujoban_sim.generator import TRAIN_SEEDS, generate_level
+from mujoban_sim.levels import Level
 from mujoban_sim.oracles import OraclePlanner
+from mujoban_sim.rules import apply
+from mujoban_sim.solver import solve_level
 from mujoban_sim.world import EpisodeSpec
 
 PLANNER_NODES = 20_000
@@ -87,15 +90,24 @@ class Options:
 
 
 def training_episodes(difficulty: int, rng: np.random.Generator) -> EpisodeSource:
-    """Return a source of levels whose seeds are drawn from `TRAIN_SEEDS`."""
+    """Return a source of levels whose seeds are drawn from `TRAIN_SEEDS`, each at a random point of its solution."""
 
     def draw() -> EpisodeSpec:
         seed = int(rng.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop))
         if seed not in TRAIN_SEEDS:
             raise AssertionError(f"seed {seed} is not a training seed")
-        return EpisodeSpec(generate_level(difficulty, seed), seed)
+        return EpisodeSpec(_advance(generate_level(difficulty, seed), rng), seed)
 
     return draw
+
+
+def _advance(level: Level, rng: np.random.Generator) -> Level:
+    """Return the level after a random share of its solution's moves, but not solved."""
+    moves = solve_level(level, max_nodes=PLANNER_NODES).moves
+    boxes, player = level.boxes, np.array(level.player)
+    for move in moves[: int(rng.integers(len(moves)))] if len(moves) else ():
+        boxes, player, *_ = apply(level.wall, level.target, boxes, player, int(move))
+    return replace(level, boxes=boxes, player=(int(player[0]), int(player[1])))
 
 
 def make_learner(config: TrainConfig, *, threads: int = 1, device: str = "cpu", stream: int = 0) -> Learner[Any]:
