@@ -25,6 +25,9 @@ from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, T
 from mujoban_rl.weights import provenance, save_weights
 from mujoban_sim.grid import AGENT, BOX, TARGET, WALL
 
+_STOCK_BATCHES = 800
+"""Batches of demonstrations kept ahead, and learned from before the planner's own play is worth correcting."""
+
 
 @dataclass(frozen=True)
 class ImitationConfig(NetworkConfig):
@@ -250,8 +253,9 @@ class ImitationTrainer:
     def _collect(self) -> None:
         """Fetch lessons where the buffers lag behind what was consumed."""
         first = self.demonstrations.size == 0
-        fresh_wanted = self.demonstrations.added < 100_000 + 0.5 * self.samples
-        played_wanted = self.samples > 100_000 and self.corrections.added < 0.5 * self.samples
+        stock = _STOCK_BATCHES * self.config.batch_size
+        fresh_wanted = self.demonstrations.added < stock + 0.5 * self.samples
+        played_wanted = self.samples > stock and self.corrections.added < 0.5 * self.samples
         if self._maker is not None:
             if fresh_wanted:
                 self.demonstrations.add(self._maker.demonstrations())

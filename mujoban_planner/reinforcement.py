@@ -267,8 +267,8 @@ class MPOTrainer:
             self.target.load_state_dict(self.network.state_dict())
         finished = self.replay.storage["terminated"][: len(self.replay)].float().mean()
         named = {f"mpo/{k}": float(v) for k, v in stats._asdict().items()}
-        progress = {"q_loss": float(q_loss), "mean_reward": float(reward.mean()), "solved_per_step": float(finished)}
-        return progress | named
+        progress = {"q_loss": q_loss.detach(), "mean_reward": reward.mean(), "solved_per_step": finished}
+        return {k: float(v) for k, v in progress.items()} | named
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16)

@@ -1,0 +1,161 @@
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import mujoban_planner
+from mujoban_planner import bag_transitions, train
+from mujoban_planner.imitation import ImitationConfig, ImitationTrainer, imitation_loss, make_uncertain
+from mujoban_planner.lessons import LessonMaker
+from mujoban_planner.reinforcement import LevelStream, MPOConfig, MPOTrainer, reset_stay_logit
+from mujoban_planner.samples import make_batch
+from mujoban_rl.weights import WeightsError
+from mujoban_sim.generator import TRAIN_SEEDS
+from mujoban_sim.grid import AGENT, BOX, TARGET, WALL
+
+SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    torch.set_num_threads(1)
+    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
+    monkeypatch.setattr("mujoban_planner.imitation._STOCK_BATCHES", 4)
+    monkeypatch.setattr("mujoban_planner.lessons._PLAY_LIMIT", 8)
+
+
+def _imitate(path, samples, config=None):
+    trainer = ImitationTrainer(config or ImitationConfig(**SMALL, buffer=50_000), path, processes=0)
+    trainer.run(seconds=None, samples=samples, evaluate_every=math.inf, save_every=math.inf)
+    return trainer
+
+
+def test_imitation_learns_resumes_and_writes_a_loadable_planner(tmp_path):
+    trainer = _imitate(tmp_path, 96)
+    assert trainer.samples == 96
+    again = _imitate(tmp_path, 128)
+    assert again.samples == 128 and again.bits == 2
+    planner = mujoban_planner.load(tmp_path / "planner.safetensors")
+    assert planner.config == again.network.config
+    record = json.loads((tmp_path / "planner.json").read_text())
+    assert record["samples"] == 128 and "solve_rate/1" in record["metrics"]
+
+
+def test_the_same_run_gives_the_same_weights(tmp_path):
+    one, other = (_imitate(tmp_path / name, 96) for name in ("a", "b"))
+    for a, b in zip(one.network.parameters(), other.network.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_small_batch_can_be_learned_by_heart():
+    torch.manual_seed(0)
+    config = ImitationConfig(**SMALL)
+    network = config.build()
+    samples = LessonMaker(0, {3: 1.0}).demonstrations(2)
+    samples = samples.take(samples.right != 0)
+    batch = make_batch(samples, np.zeros(len(samples.agent), np.int64))
+    adam = torch.optim.Adam(network.parameters(), 1e-2)
+    for _ in range(150):
+        loss, stats = imitation_loss(network, batch, config)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+    assert stats["accuracy"] > 0.95 and stats["push_accuracy"] > 0.8
+
+
+def test_uncertain_states_keep_boxes_targets_and_robot_recognisable():
+    samples = LessonMaker(0, {5: 1.0}).demonstrations(8)
+    batch = make_batch(samples, np.zeros(len(samples.agent), np.int64))
+    soft = make_uncertain(batch.state, 1.0, torch.Generator().manual_seed(0))
+    assert soft.min() >= 0.0 and soft.max() <= 1.0 and not torch.equal(soft, batch.state)
+    for layer in (TARGET, BOX):
+        assert (soft[..., layer][batch.state[..., layer] > 0] > 0.5).all()
+    assert torch.equal(soft[..., AGENT].flatten(1).argmax(1), batch.state[..., AGENT].flatten(1).argmax(1))
+    assert (soft[:, [0, -1], :, WALL] == 1).all()
+    assert torch.equal(make_uncertain(batch.state, 0.0, torch.Generator()), batch.state)
+
+
+def test_mpo_resumes_and_writes_a_loadable_planner(tmp_path):
+    config = MPOConfig(
+        channels=8, blocks=1, environments=8, batch_size=8, warm_up_steps=8, replay_steps=50, failure_rate=0.1
+    )
+    for updates in (4, 8):
+        trainer = MPOTrainer(config, tmp_path)
+        trainer.run(seconds=None, updates=updates, evaluate_every=math.inf, save_every=math.inf)
+        assert trainer.updates == updates
+    assert mujoban_planner.load(tmp_path / "planner.safetensors").config["channels"] == 8
+
+
+def test_mpo_after_imitation_gives_stay_a_chance():
+    network = ImitationConfig(**SMALL).build()
+    with torch.no_grad():
+        network.heads.policy.bias[0] = -30.0
+    reset_stay_logit(network)
+    bias = network.heads.policy.bias
+    assert abs(bias[0] - bias[1:].mean()) < 3.0
+
+
+def test_training_levels_are_training_seeds_and_never_repeat():
+    stream = LevelStream({1: 0.5, 5: 0.5}, seed=3)
+    first = stream.next_seed
+    assert first in TRAIN_SEEDS
+    a, b = stream.draw(16), stream.draw(16)
+    assert stream.next_seed == first + 32 and not torch.equal(a, b)
+
+
+class _Value:
+    def __init__(self, **fields):
+        self.__dict__.update(fields)
+
+
+def _tick(episode, step, reward, sequence, direction=1, *, solved=False, truncated=False, timed_out=False):
+    state = np.full((10, 10, 4), step, np.float32)
+    return _Value(
+        values=(
+            _Value(episode=episode, reward=reward, solved=solved, truncated=truncated),
+            state,
+            _Value(sequence=sequence, direction=direction),
+            _Value(timed_out=timed_out),
+        )
+    )
+
+
+def test_bags_give_completed_instructions_with_their_rewards():
+    ticks = [
+        _tick(1, 0, 0.0, 1, 2),
+        _tick(1, 1, 0.0, 1, 2),
+        _tick(1, 2, 1.0, 2, 3),  # instruction 1 done, a box came onto a target
+        _tick(1, 3, 0.0, 3, 4, timed_out=True),  # instruction 2 failed: dropped
+        _tick(1, 4, 11.0, 3, 4, solved=True),
+        _tick(2, 5, 0.0, 1, 1),
+        _tick(2, 6, 0.0, 1, 1, truncated=True),
+    ]
+    rows = bag_transitions.transitions(ticks)
+    assert [(int(s[0, 0, 0]), a, round(r, 2), int(n[0, 0, 0]), done) for s, a, r, n, done in rows] == [
+        (0, 2, 0.99, 2, False),
+        (3, 4, 10.99, 4, True),
+    ]
+
+
+def test_bad_training_input_ends_with_one_line_and_status_2(tmp_path, monkeypatch, capsys):
+    _imitate(tmp_path, 32)
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", ["train", "imitation", "--run", str(tmp_path), "--channels", "16"])
+    with pytest.raises(SystemExit) as exit_:
+        train.main()
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert "another configuration" in error and len(error.splitlines()) == 1
+
+
+def test_damaged_weights_are_refused(tmp_path):
+    _imitate(tmp_path, 32)
+    path = tmp_path / "planner.safetensors"
+    path.write_bytes(path.read_bytes()[:-4] + b"abcd")
+    with pytest.raises(WeightsError, match="damaged"):
+        mujoban_planner.load(path)
+
+
