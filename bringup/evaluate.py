@@ -6,6 +6,7 @@ With `--graph` the same episodes run through the ROS graph, one after the other.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -65,7 +66,7 @@ def evaluate(
         return rollout(policy, world, episodes, on_result=on_result)
 
 
-def main() -> int:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = Parser(PROG, description="Evaluate the stack on many levels in one vectorised rollout.")
     add_episode_options(parser, episodes=256)
@@ -74,7 +75,7 @@ def main() -> int:
     parser.add_argument("--threads", type=positive, default=1, help="threads of physics and networks")
     parser.add_argument("--graph", action="store_true", help="play through the ROS graph instead")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there instead of printing it")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(command_line)
     import_from_here()
     episodes, stack = episodes_from(arguments), stack_from(arguments)
     if arguments.graph:

@@ -1,0 +1,123 @@
+"""The commands: what they write, and one line on stderr with exit status 2 for bad input."""
+
+import json
+from functools import partial
+
+import imageio.v2 as imageio
+import pytest
+
+from bringup import evaluate, run_stack
+from bringup.command import run_command
+from mujoban_sim import rendering
+from mujoban_sim.levels import Level, write_levels
+
+ALL_ORACLES = ["--oracle", "estimator,termination,planner,controller"]
+BUT_PLANNER = ["--oracle", "estimator,termination,controller"]
+UNSOLVABLE = """\
+#####
+#@  #
+#  $#
+#.  #
+#####
+"""
+
+
+def run(command, *arguments):
+    with pytest.raises(SystemExit) as exit:
+        run_command("command", partial(command.main, [str(a) for a in arguments]))
+    return exit.value.code
+
+
+def test_run_stack_plays_records_films_and_reports(tmp_path, capfd):
+    report, bag, video = tmp_path / "out.json", tmp_path / "bag", tmp_path / "film.mp4"
+    status = run(
+        run_stack, "--difficulty", 1, "--episodes", 2, "--seed", 1000, "--headless", *ALL_ORACLES,
+        "--json", report, "--record", bag, "--video", video,
+    )  # fmt: skip
+    assert status == 0
+    content = json.loads(report.read_text())
+    assert content["success_rate"] == 1.0 and [e["seed"] for e in content["episodes"]] == [1000, 1001]
+    assert {"success_interval", "mean_return", "weights", "ticks_per_second"} <= content.keys()
+    assert "solved 2 of 2" in capfd.readouterr().out
+    assert (bag / "metadata.yaml").is_file()
+    film = imageio.get_reader(video).get_meta_data()
+    assert film["codec"] == "h264" and film["pix_fmt"].startswith("yuv420p") and film["size"] == (768, 384)
+    assert film["duration"] >= 0.05 * sum(e["steps"] for e in content["episodes"])
+
+
+def test_run_stack_shows_instruction_estimate_and_truth(capfd):
+    assert run(run_stack, "--difficulty", 1, *ALL_ORACLES) == 0
+    out = capfd.readouterr().out
+    assert "instruction" in out and "estimate" in out and "ground truth" in out and "solved 1 of 1" in out
+
+
+def test_evaluate_gives_the_same_in_process_and_through_the_graph(tmp_path):
+    reports = []
+    for extra in ([], ["--graph"]):
+        path = tmp_path / f"out{len(extra)}.json"
+        assert run(evaluate, "--difficulty", 1, "--episodes", 2, *ALL_ORACLES, "--json", path, *extra) == 0
+        reports.append(json.loads(path.read_text()))
+    assert reports[0]["episodes"] == reports[1]["episodes"]
+
+
+def test_an_unsolvable_level_is_played_and_said_to_be(tmp_path, capfd):
+    levels = tmp_path / "levels.txt"
+    write_levels(levels, [Level.from_text(UNSOLVABLE)])
+    assert run(evaluate, "--levels", levels, "--episodes", 1, *ALL_ORACLES, "--time-limit", 5) == 0
+    captured = capfd.readouterr()
+    assert "level 0" in captured.err and "unsolvable" in captured.err
+    assert json.loads(captured.out)["success_rate"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--difficulty", "9"], "9"),
+        (["--episodes", "0"], "0"),
+        (["--seed", "-1", *ALL_ORACLES], "-1"),
+        (["--oracle", "navigator"], "navigator"),
+        (["--levels", "missing.txt", *ALL_ORACLES], "missing.txt"),
+        (["--planner", "missing.safetensors", *BUT_PLANNER], "missing.safetensors"),
+        (["--planner", "no.such.module:Planner", *BUT_PLANNER], "no.such"),
+        (["--planner", "mujoban_sim.oracles:OracleController", *BUT_PLANNER], "Planner"),
+        (["--realtime", "-2"], "-2"),
+        (["--video", "film.avi", *ALL_ORACLES], "film.avi"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_on_stderr_and_status_2(capfd, arguments, named):
+    assert run(run_stack, "--headless", *arguments) == 2
+    err = capfd.readouterr().err.strip()
+    assert named in err and "\n" not in err
+
+
+@pytest.mark.parametrize("text", ["####\n#  #\n####\n", "#####\n#@@ #\n#$. #\n#####\n", "#####\n#@$$.\n#####\n"])
+def test_a_malformed_level_file_is_refused(tmp_path, capfd, text):
+    levels = tmp_path / "bad.txt"
+    levels.write_text(text)
+    assert run(run_stack, "--headless", "--levels", levels, *ALL_ORACLES) == 2
+    err = capfd.readouterr().err.strip()
+    assert "\n" not in err and err
+
+
+def test_damaged_weights_are_refused(fresh_weights, tmp_path, capfd):
+    good = fresh_weights.choices["controller"].weights
+    damaged = tmp_path / "controller.safetensors"
+    data = bytearray(good.read_bytes())
+    data[-1] ^= 1
+    damaged.write_bytes(data)
+    damaged.with_suffix(".json").write_text(good.with_suffix(".json").read_text())
+    status = run(
+        run_stack, "--headless", "--controller", damaged, "--oracle", "estimator,termination,planner"
+    )
+    assert status == 2
+    err = capfd.readouterr().err.strip()
+    assert "damaged" in err and "\n" not in err
+
+
+def test_without_opengl_the_commands_say_what_to_install(monkeypatch, capfd):
+    def no_context(size):
+        raise rendering.RenderingError("cannot open an OpenGL context: install the Debian packages libegl1 and others")
+
+    monkeypatch.setattr(rendering, "open_context", no_context)
+    assert run(run_stack, "--headless", "--difficulty", 1, *ALL_ORACLES) == 2
+    assert "error: cannot open an OpenGL context: install the Debian packages libegl1" in capfd.readouterr().err
