@@ -44,7 +44,7 @@ class Disturbance:
     """Share of episodes that are random walks."""
     stray: float = 0.05
     """Chance that an instruction is random all the same."""
-    infeasible: float = 0.03
+    infeasible: float = 0.15
     """Chance that a random instruction is drawn from all five, not from those that move the robot."""
     delay: float = 0.4
     """Chance that an instruction's termination is late."""
