@@ -1,0 +1,144 @@
+"""The node that shows the graph to standard tools, RViz and Foxglove among them (`python -m bringup.viz`).
+
+It only subscribes to the graph, so it works beside a running stack and on a bag that is played back.
+"""
+
+from __future__ import annotations
+
+import sys
+from array import array
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Vector3
+from mujoban_msgs.msg import AbstractState
+from nav_msgs.msg import MapMetaData, OccupancyGrid
+from numpy.typing import NDArray
+from rclpy.node import Node
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.tick_node import live_qos, run_node
+from mujoban_sim.grid import CELL_SIZE, CHANNELS, TARGET, WALL, cell_to_xy
+
+PREFIX: Final = "/viz"
+PERIOD: Final = 2
+"""Ticks between two messages of a topic: 10 Hz is enough for the eye."""
+_BOX_SIZE: Final = (0.8, 0.8, 0.3)
+_HEIGHTS: Final = {"wall": 0.5, "target": 0.01}
+_COLOURS: Final = {
+    "wall": (0.55, 0.5, 0.5, 1.0),
+    "target": (0.8, 0.1, 0.1, 1.0),
+    "box": (0.8, 0.75, 0.1, 1.0),
+    "robot": (0.2, 0.4, 0.9, 1.0),
+}
+
+
+class VizNode(Node):
+    """Publishes the four layers of the estimate as occupancy grids and the true scene as markers.
+
+    Topics: `/viz/estimate/<layer>` and `/viz/ground_truth/<layer>` (nav_msgs/OccupancyGrid, percent, frame `map`) for
+    the layers wall, target, agent and box; `/viz/scene` (visualization_msgs/MarkerArray).
+    """
+
+    def __init__(self, **options: Any) -> None:
+        """Start listening."""
+        super().__init__("viz", **options)
+        self._pose: Pose | None = None
+        self._boxes: list[Pose] = []
+        self._grids = {
+            (source, name): self.create_publisher(OccupancyGrid, f"{PREFIX}/{source}/{name}", 1)
+            for source in ("estimate", "ground_truth")
+            for name in CHANNELS
+        }
+        self._scene = self.create_publisher(MarkerArray, f"{PREFIX}/scene", 1)
+        listen = live_qos()
+        self.create_subscription(AbstractState, topics.ABSTRACT_STATE.name, self._on_estimate, listen)
+        self.create_subscription(AbstractState, topics.TRUE_ABSTRACT_STATE.name, self._on_truth, listen)
+        self.create_subscription(PoseStamped, topics.POSE.name, self._on_pose, listen)
+        self.create_subscription(PoseArray, topics.TRUE_BOXES.name, self._on_boxes, listen)
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        self._pose = message.pose
+
+    def _on_boxes(self, message: PoseArray) -> None:
+        self._boxes = list(message.poses)
+
+    def _on_estimate(self, message: AbstractState) -> None:
+        if self._is_due(message):
+            self._publish_grids("estimate", message.header, conversions.abstract_state_from_msg(message))
+
+    def _on_truth(self, message: AbstractState) -> None:
+        if self._is_due(message):
+            state = conversions.abstract_state_from_msg(message)
+            self._publish_grids("ground_truth", message.header, state)
+            self._scene.publish(MarkerArray(markers=self._markers(map_header(message.header), state)))
+
+    def _is_due(self, message: AbstractState) -> bool:
+        return conversions.stamp_of(message) // topics.TICK % PERIOD == 0
+
+    def _publish_grids(self, source: str, header: Header, state: NDArray[np.float32]) -> None:
+        for channel, name in enumerate(CHANNELS):
+            self._grids[source, name].publish(occupancy_grid(header, state[..., channel]))
+
+    def _markers(self, header: Header, state: NDArray[np.float32]) -> list[Marker]:
+        markers = []
+        for name, channel in (("wall", WALL), ("target", TARGET)):
+            height = _HEIGHTS[name]
+            centres = cell_to_xy(np.argwhere(state[..., channel] > 0.5))
+            poses = [_pose(x, y, height / 2) for x, y in centres]
+            markers.append(_cubes(header, name, poses, (CELL_SIZE, CELL_SIZE, height)))
+        boxes = [_pose(p.position.x, p.position.y, _BOX_SIZE[2] / 2) for p in self._boxes]
+        markers.append(_cubes(header, "box", boxes, _BOX_SIZE))
+        if self._pose is not None:
+            markers.append(_marker(header, "robot", Marker.ARROW, (0.6, 0.15, 0.15), self._pose))
+        return markers
+
+
+def map_header(header: Header) -> Header:
+    """Return a header of the same stamp in the frame `map`."""
+    return Header(stamp=header.stamp, frame_id=topics.MAP_FRAME)
+
+
+def occupancy_grid(header: Header, layer: NDArray[np.float32]) -> OccupancyGrid:
+    """Return one layer of an abstract state, [N, N], as percent per cell.
+
+    An occupancy grid begins in the south-west; row 0 of an abstract state is north.
+    """
+    rows, columns = layer.shape
+    corner = Point(x=-columns * CELL_SIZE / 2, y=-rows * CELL_SIZE / 2)
+    percent = np.rint(100 * layer[::-1]).astype(np.int8)
+    info = MapMetaData(resolution=CELL_SIZE, width=columns, height=rows, origin=Pose(position=corner))
+    info.map_load_time = header.stamp
+    return OccupancyGrid(header=map_header(header), info=info, data=array("b", percent.tobytes()))
+
+
+def _cubes(header: Header, name: str, poses: Sequence[Pose], size: tuple[float, float, float]) -> Marker:
+    marker = _marker(header, name, Marker.CUBE_LIST, size, Pose())
+    marker.points = [pose.position for pose in poses]
+    if not poses:
+        marker.action = Marker.DELETE
+    return marker
+
+
+def _marker(header: Header, name: str, kind: int, size: tuple[float, float, float], pose: Pose) -> Marker:
+    red, green, blue, alpha = _COLOURS[name]
+    return Marker(
+        header=header, ns=name, id=0, type=kind, action=Marker.ADD, pose=pose,
+        scale=Vector3(x=size[0], y=size[1], z=size[2]), color=ColorRGBA(r=red, g=green, b=blue, a=alpha),
+    )  # fmt: skip
+
+
+def _pose(x: float, y: float, z: float) -> Pose:
+    return Pose(position=Point(x=float(x), y=float(y), z=float(z)))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(VizNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,64 @@
+"""What tools for looking at the graph receive: standard messages, and a Rerun recording."""
+
+import numpy as np
+import pytest
+from nav_msgs.msg import OccupancyGrid
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from visualization_msgs.msg import Marker, MarkerArray
+
+from bringup.viz import VizNode, occupancy_grid
+from mujoban_msgs_py import conversions
+from mujoban_sim.episodes import Episodes
+from mujoban_sim.grid import BOX, TARGET, WALL, cell_to_xy
+
+ENTITIES = {
+    "/camera/first_person", "/camera/top_down", "/grid/estimate", "/grid/ground_truth", "/instruction",
+    "/beta/probability", "/torque", "/reward/return", "/milliseconds/estimator", "/milliseconds/controller",
+}  # fmt: skip
+
+
+class Listener(Node):
+    def __init__(self):
+        super().__init__("listener")
+        self.grids, self.scenes = [], []
+        self.create_subscription(OccupancyGrid, "/viz/ground_truth/wall", self.grids.append, 10)
+        self.create_subscription(MarkerArray, "/viz/scene", self.scenes.append, 10)
+
+
+def test_an_occupancy_grid_begins_in_the_south_west():
+    layer = np.zeros((10, 10), np.float32)
+    layer[9, 0], layer[0, 9] = 1.0, 0.25
+    grid = occupancy_grid(conversions.header(0), layer)
+    percent = np.array(grid.data).reshape(grid.info.height, grid.info.width)
+    assert percent[0, 0] == 100 and percent[9, 9] == 25 and percent.sum() == 125
+    south_west = cell_to_xy((9, 0))
+    assert grid.info.origin.position.x == south_west[0] - 0.5 and grid.info.origin.position.y == south_west[1] - 0.5
+    assert grid.header.frame_id == "map"
+
+
+def test_standard_tools_see_the_layers_and_the_scene(play_graph):
+    episodes = Episodes(1, 0, difficulty=2)
+    level = episodes[0].level.abstract_state()
+    graph = play_graph(episodes=episodes)
+    listener = graph.graph.add(Listener())
+    graph.graph.add(VizNode())
+    graph.spin_until(lambda: listener.grids and listener.scenes and len(listener.scenes[-1].markers) == 4)
+    percent = np.array(listener.grids[-1].data).reshape(10, 10)[::-1]
+    assert (percent == 100 * level[..., WALL]).all()
+    markers = {marker.ns: marker for marker in listener.scenes[-1].markers}
+    assert len(markers["target"].points) == level[..., TARGET].sum()
+    assert len(markers["box"].points) == level[..., BOX].sum()
+    assert markers["robot"].type == Marker.ARROW
+
+
+def test_a_recording_of_the_live_view_holds_every_entity(play_graph, tmp_path):
+    chunk = pytest.importorskip("rerun.chunk")
+    from bringup.live import LiveNode
+
+    file = tmp_path / "play.rrd"
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
+    graph.graph.add(LiveNode(parameter_overrides=[Parameter("save", value=str(file))]))
+    graph.finish()
+    graph.__exit__(None, None, None)
+    assert {part.entity_path for part in chunk.RrdReader(str(file)).stream()} >= ENTITIES
