@@ -225,8 +225,8 @@ def _checked(batch: LevelBatch) -> LevelBatch:
 def _solve(batch: LevelBatch, max_nodes: int, weight: float) -> _Solved:
     if max_nodes < 1:
         raise ValueError(f"max_nodes {max_nodes}: expected at least 1")
-    if not 1.0 <= weight < 100.0:
-        raise ValueError(f"weight {weight}: expected 1 (optimal) to 100")
+    if not 1.0 <= weight <= 10.0:
+        raise ValueError(f"weight {weight}: expected 1 (optimal) to 10")
     count = len(batch.wall)
     status, length, nodes = np.zeros((3, count), np.int64)
     first = np.zeros(count + 1, np.int64)

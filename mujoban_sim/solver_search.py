@@ -53,10 +53,12 @@ class Workspace(NamedTuple):
     """[Q]."""
     entry_cost: NDArray[np.int16]
     """Cost when it was queued; an entry is stale when its state's cost has fallen since, [Q]."""
+    entry_walk: NDArray[np.uint8]
+    """Walking distance of the pushes that are still to be generated, [Q]."""
     entry_next: NDArray[np.int32]
     """Next entry of the same bucket, [Q]."""
     bucket: NDArray[np.int32]
-    """First entry of each total estimate, -1 for none, [_BUCKETS]."""
+    """First entry of each estimate, -1 for none, [_BUCKETS + S]; a walk may lead beyond the largest."""
 
 
 def make_workspace(max_nodes: int) -> Workspace:
@@ -74,8 +76,9 @@ def make_workspace(max_nodes: int) -> Workspace:
         table=np.full(table_size, -1, np.int32),
         entry_state=np.empty(entries, np.int32),
         entry_cost=np.empty(entries, np.int16),
+        entry_walk=np.empty(entries, np.uint8),
         entry_next=np.empty(entries, np.int32),
-        bucket=np.full(_BUCKETS, -1, np.int32),
+        bucket=np.full(_BUCKETS + SQUARES, -1, np.int32),
     )
 
 
@@ -176,6 +179,16 @@ def _clean(work: Workspace, states: Int, buckets: Int) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _stands(boxes: Bits, landing: Bits) -> Bits:
+    """Return the squares from which a box is pushed onto a square of `landing`."""
+    stands = NONE
+    for direction in range(4):
+        back = (direction + 2) % 4
+        stands |= shift(shift(landing, back) & boxes, back)
+    return stands
+
+
+@njit(cache=True, nogil=True)
 def _read_pushes(work: Workspace, state: Int) -> NDArray[np.uint8]:
     """Return the pushes that lead to a state, in order."""
     length, at = 0, state
@@ -208,21 +221,22 @@ def search(
     Returns:
         Status, pushes (4 * square + direction), the solution's moves, and states stored.
     """
+    # One function: numba hands a Workspace on field by field, and split up the search ran at half the speed.
     distance = push_distances(floor, target)
     dead = dead_squares(distance)
     wall = ~floor
     scratch = np.empty(1 << min(distance.shape[1], MAX_ASSIGNED), np.int64)
     bound = assignment(boxes, distance, scratch)
-    if bound >= _INFINITE:
-        return UNSOLVABLE, np.empty(0, np.uint8), 0, 0
+    estimate = int(weight * bound)
+    if bound >= _INFINITE or estimate >= _BUCKETS:
+        return UNSOLVABLE if bound >= _INFINITE else BUDGET, np.empty(0, np.uint8), 0, 0
     max_nodes = min(max_nodes, len(work.boxes) - 1)
     slot = _find(work, boxes, player)
     work.table[slot] = 0
     work.boxes[0], work.player[0], work.slot[0] = boxes, player, slot
     work.cost[0], work.bound[0], work.parent[0] = 0, bound, -1
-    estimate = int(weight * bound)
     work.entry_state[0], work.entry_cost[0], work.entry_next[0] = 0, 0, -1
-    work.bucket[estimate] = 0
+    work.entry_walk[0], work.bucket[estimate] = 0, 0
     states, entries, last = 1, 1, estimate
     status, end = UNSOLVABLE, -1
     while status == UNSOLVABLE:
@@ -242,11 +256,24 @@ def search(
         here = np.uint64(work.boxes[state])
         free = floor & ~here
         landing = free & ~dead
+        stands = _stands(here, landing)
         frontier = bit(np.int64(work.player[state]))
         reached = frontier
-        # Walk outwards one step at a time; every box that the frontier touches may be pushed onwards.
+        walk, due = 0, np.int64(work.entry_walk[entry])
+        base = cost + int(weight * work.bound[state])
         while frontier != NONE:
-            cost += 1
+            if walk < due or frontier & stands == NONE:
+                frontier = spread(frontier) & free & ~reached
+                reached |= frontier
+                walk += 1
+                continue
+            if base + walk > estimate:
+                # What else the state leads to has its turn later.
+                work.entry_walk[entry], work.entry_next[entry] = walk, work.bucket[base + walk]
+                work.bucket[base + walk] = entry
+                last = max(last, base + walk)
+                break
+            cost = np.int64(work.entry_cost[entry]) + walk + 1
             for direction in range(4):
                 pushable = shift(frontier, direction) & here & shift(landing, (direction + 2) % 4)
                 while pushable != NONE:
@@ -263,9 +290,11 @@ def search(
                         states += 1
                         work.table[slot] = child
                         work.boxes[child], work.player[child], work.slot[child] = after, square, slot
+                        work.cost[child] = _PRUNED
+                        if frozen(after, wall, dead) & ~target != NONE:
+                            continue
                         bound = assignment(after, distance, scratch)
-                        if bound >= _INFINITE or frozen(after, wall, dead) & ~target != NONE:
-                            work.cost[child] = _PRUNED
+                        if bound >= _INFINITE:
                             continue
                         work.bound[child] = bound
                     elif work.cost[child] <= cost:
@@ -277,12 +306,11 @@ def search(
                     work.cost[child], work.parent[child] = cost, state
                     work.push[child] = 4 * square + direction
                     work.entry_state[entries], work.entry_cost[entries] = child, cost
-                    work.entry_next[entries] = work.bucket[total]
+                    work.entry_walk[entries], work.entry_next[entries] = 0, work.bucket[total]
                     work.bucket[total] = entries
                     entries += 1
                     estimate, last = min(estimate, total), max(last, total)
-            frontier = spread(frontier) & free & ~reached
-            reached |= frontier
+            due = walk + 1
     pushes = np.empty(0, np.uint8)
     moves = 0
     if status == SOLVED:
