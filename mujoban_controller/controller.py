@@ -7,6 +7,9 @@ Proprioception holds joint positions, so the network is given sine and cosine of
 turned into the frame of the instruction (instructed direction = +x). For the ball, whose steer joint is the
 heading, this says at once by how much to turn.
 
+It is also given dead reckoning: how far the robot has come since the instruction began, which is the sum of the
+velocities that it feels. The sum is part of the memory, beside the LSTM's; A, o_pr and beta are all it takes.
+
 Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators, F features, H memory units.
 """
 
@@ -24,7 +27,7 @@ from torch.nn import functional
 
 from mujoban_sim.bodies import INERTIAL_SIZE, get_body
 from mujoban_sim.camera import FRAME_SIZE, CameraMount, project
-from mujoban_sim.grid import OFFSETS_XY, Instruction
+from mujoban_sim.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction
 from mujoban_sim.interfaces import Controller, ControllerInput, Memory
 
 MIN_SCALE = 1e-3
@@ -32,6 +35,7 @@ MIN_SCALE = 1e-3
 INITIAL_SCALE = 0.5
 """Standard deviation of every torque before training."""
 _CLIP = 5.0
+_TRACK = 7
 
 
 class Gaussian(NamedTuple):
@@ -61,6 +65,43 @@ def gaussian(mean: Tensor, raw_scale: Tensor) -> Gaussian:
     return Gaussian(mean, scale + MIN_SCALE)
 
 
+class Recurrent(NamedTuple):
+    """What the controller remembers."""
+
+    output: Tensor
+    """LSTM output, [B, H]."""
+    cell: Tensor
+    """LSTM cell, [B, H]."""
+    track: Tensor
+    """Dead reckoning, [B, 7]; see `dead_reckoning`."""
+
+
+def dead_reckoning(track: Tensor, velocity: Tensor, heading: Tensor, terminated: Tensor, period: float) -> Tensor:
+    """Return the track after one more tick, [B, 7].
+
+    It holds the displacement since the instruction in force began (2), that during the instruction before (2), the
+    velocity of this tick (2), all in the frame of `heading`, and whether there is one (1).
+
+    Args:
+        track: Before the tick, [B, 7]; zeros at an episode's start.
+        velocity: In the robot's frame in cells per second, [B, 2].
+        heading: Angle of the robot in radians, [B].
+        terminated: Whether a new instruction begins with this tick, [B].
+        period: Seconds of a tick.
+    """
+    moved, before, last, known = track[:, :2], track[:, 2:4], track[:, 4:6], track[:, 6:]
+    cos, sin = heading.cos(), heading.sin()
+    now = torch.stack(
+        [velocity[:, 0] * cos - velocity[:, 1] * sin, velocity[:, 0] * sin + velocity[:, 1] * cos], -1
+    )
+    # Trapezoidal rule; an episode's first tick has nothing to come from.
+    moved = moved + 0.5 * period * (now + last) * known
+    new = terminated[:, None]
+    before = torch.where(new, moved, before)
+    moved = torch.where(new, torch.zeros_like(moved), moved)
+    return torch.cat([moved, before, now, torch.ones_like(known)], -1)
+
+
 class ControllerOutput(NamedTuple):
     """Result of `VisuomotorController.forward`."""
 
@@ -68,8 +109,8 @@ class ControllerOutput(NamedTuple):
     """Distribution over torques; mean and scale [B, T, U]."""
     features: Tensor
     """What the action rests on, [B, T, H + F]; auxiliary losses attach here."""
-    memory: tuple[Tensor, Tensor]
-    """LSTM output and cell after the last tick, [B, H] each."""
+    memory: Recurrent
+    """Memory after the last tick."""
 
 
 class ResidualBlock(nn.Module):
@@ -111,6 +152,11 @@ def rows_of_sky(mount: CameraMount, multiple: int) -> int:
     return max(int(level) // multiple * multiple, 0)
 
 
+def _turn(x: Tensor, y: Tensor, along: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
+    """Return vectors (x, y), [M, n] each, in the frame whose x-axis is (along, left), [M, 1] each."""
+    return x * along + y * left, y * along - x * left
+
+
 class VisuomotorController(nn.Module, Controller):
     """The learned controller of paper C.3; sees o_cam, o_pr, A and beta and nothing else.
 
@@ -150,7 +196,10 @@ class VisuomotorController(nn.Module, Controller):
         self.joints = len(layout.joints)
         self.proprio_size, self.action_size, self.hidden = layout.proprio_size, layout.action_size, hidden
         # Joint positions are replaced by two sine-cosine pairs; A is one-hot, beta one bit.
-        inputs = self.proprio_size + 3 * self.joints + len(Instruction) + 1
+        inputs = self.proprio_size + 3 * self.joints + len(Instruction) + 1 + _TRACK - 1
+        # A root of slides has a hinge for its heading; a free one has to do with its turns since the start.
+        self.heading_joint = layout.joint_qpos.index(3) if layout.root == "slides" else None
+        self.cell_size = layout.cell_size
         shrink = 2 ** (len(channels) - 1)
         self.first_row = rows_of_sky(layout.camera, shrink)
         self.encoder = frame_encoder(channels, features, FRAME_SIZE - self.first_row)
@@ -179,26 +228,32 @@ class VisuomotorController(nn.Module, Controller):
             features = self.encoder(x)
         return features.to(x.dtype)
 
-    def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor) -> Tensor:
-        """Return the encoding of all other inputs, [M, F].
+    def reckon(self, proprio: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
+        """Return the track after one more tick, [B, 7], from o_pr [B, P], beta [B] and the track before, [B, 7]."""
+        j = self.heading_joint
+        heading = torch.zeros_like(proprio[:, 0]) if j is None else proprio[:, INERTIAL_SIZE + j]
+        return dead_reckoning(track, proprio[:, :2] / self.cell_size, heading, terminated, CONTROL_PERIOD)
+
+    def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
+        """Return the encoding of all inputs but the frame, [M, F].
 
         Args:
             proprio: o_pr, [M, P].
             instruction: A, int64 [M].
             terminated: beta, bool [M].
+            track: Dead reckoning, [M, 7].
         """
         j = self.joints
         angle = proprio[:, INERTIAL_SIZE : INERTIAL_SIZE + j]
         normal = ((proprio - self.proprio_mean) / self.proprio_scale).clamp(-_CLIP, _CLIP)
         rest = torch.cat([normal[:, :INERTIAL_SIZE], normal[:, INERTIAL_SIZE + j :]], -1)
-        cos, sin = angle.cos(), angle.sin()
         # Shape [M, 1] each.
-        along, left = self.direction[instruction].unbind(-1)
-        along, left = along[:, None], left[:, None]
-        turned = (cos * along + sin * left, sin * along - cos * left)
-        symbol = functional.one_hot(instruction, len(Instruction)).to(proprio.dtype)
-        beta = terminated.to(proprio.dtype)[:, None]
-        return self.body_encoder(torch.cat([rest, cos, sin, *turned, symbol, beta], -1))
+        along, left = (x[:, None] for x in self.direction[instruction].unbind(-1))
+        parts = [rest, angle.cos(), angle.sin(), *_turn(angle.cos(), angle.sin(), along, left)]
+        # Positions are clipped like the rest: a robot that is stuck for long must not drown everything else.
+        parts += _turn(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), along, left)
+        parts += [functional.one_hot(instruction, len(Instruction)), terminated[:, None]]
+        return self.body_encoder(torch.cat([p.to(proprio.dtype) for p in parts], -1))
 
     def forward(
         self,
@@ -206,7 +261,7 @@ class VisuomotorController(nn.Module, Controller):
         proprio: Tensor,
         instruction: Tensor,
         terminated: Tensor,
-        memory: tuple[Tensor, Tensor],
+        memory: Recurrent,
         first: Tensor | None = None,
     ) -> ControllerOutput:
         """Run the policy over sequences.
@@ -216,24 +271,27 @@ class VisuomotorController(nn.Module, Controller):
             proprio: o_pr, [B, T, P].
             instruction: A, int64 [B, T].
             terminated: beta, bool [B, T].
-            memory: LSTM output and cell before the first tick, [B, H] each.
+            memory: Before the first tick.
             first: Ticks before which an episode begins and the memory is cleared, bool [B, T].
         """
         b, t = instruction.shape
+        keep = torch.ones_like(proprio[..., :1]) if first is None else (~first[..., None]).to(proprio.dtype)
+        h, c, track = memory
+        tracks = []
+        for i in range(t):
+            track = self.reckon(proprio[:, i], terminated[:, i], track * keep[:, i])
+            tracks.append(track)
         seen = self.encode(frame.flatten(0, 1))
-        felt = self.embed(proprio.flatten(0, 1), instruction.flatten(), terminated.flatten())
+        tracked = torch.stack(tracks, 1).flatten(0, 1)
+        felt = self.embed(proprio.flatten(0, 1), instruction.flatten(), terminated.flatten(), tracked)
         # Shape [B, T, F].
         mixed = self.mix(torch.cat([seen, felt], -1)).view(b, t, -1)
-        h, c = memory
         outputs = []
         for i in range(t):
-            if first is not None:
-                keep = (~first[:, i, None]).to(h.dtype)
-                h, c = h * keep, c * keep
-            h, c = self.lstm(mixed[:, i], (h, c))
+            h, c = self.lstm(mixed[:, i], (h * keep[:, i], c * keep[:, i]))
             outputs.append(h)
         features = torch.cat([torch.stack(outputs, 1), mixed], -1)
-        return ControllerOutput(self.distribution(features), features, (h, c))
+        return ControllerOutput(self.distribution(features), features, Recurrent(h, c, track))
 
     def distribution(self, features: Tensor) -> Gaussian:
         """Return the distribution over torques given `ControllerOutput.features`."""
@@ -241,14 +299,14 @@ class VisuomotorController(nn.Module, Controller):
         return gaussian(self.mean(x), self.scale(x))
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return zeros: LSTM output and cell, [B, H] each."""
-        weight = self.mean.weight
-        return tuple(torch.zeros(batch, self.hidden, device=weight.device) for _ in range(2))
+        """Return zeros, a `Recurrent`."""
+        device = self.mean.weight.device
+        return Recurrent(*(torch.zeros(batch, n, device=device) for n in (self.hidden, self.hidden, _TRACK)))
 
     @torch.inference_mode()
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return the mean torque limited to [-1, 1], [B, U], and the next memory."""
-        output = self.forward(*self.to_tensors(inputs), memory=(state[0], state[1]))
+        output = self.forward(*self.to_tensors(inputs), memory=Recurrent(*state))
         return output.action.mean[:, 0].clamp(-1.0, 1.0).cpu().numpy(), output.memory
 
     def to_tensors(self, inputs: ControllerInput) -> tuple[Tensor, Tensor, Tensor, Tensor]:

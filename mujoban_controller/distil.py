@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.controller import ControllerOutput, VisuomotorController
+from mujoban_controller.controller import ControllerOutput, Recurrent, VisuomotorController
 from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask, TaskStep
-from mujoban_controller.replay import SequenceReplay
+from mujoban_controller.replay import SequenceReplay, memory_fields
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.interfaces import Memory, renew_rows
 
@@ -120,7 +120,7 @@ class Collector:
         share = 1.0 - self.frames / max(self.config.warm_up, 1)
         driven = self._rng.random(b) < max(share, self.config.teacher_share)
         noisy = self._rng.random(b) < 1 / 3
-        starts = {"h": self._memory[0].numpy().copy(), "c": self._memory[1].numpy().copy()}
+        starts = memory_fields(self._memory)
         rows, steps = [], []
         for _ in range(self.config.length):
             tick, outcome = self._tick(driven, noisy)
@@ -135,7 +135,7 @@ class Collector:
         self._memory = renew_rows(self._memory, self.student.initial_memory(len(first)), first)
         inputs = task.observe()
         label = self.teacher(task)
-        output = self.student(*self.student.to_tensors(inputs), memory=self._memory)
+        output = self.student(*self.student.to_tensors(inputs), memory=Recurrent(*self._memory))
         self._memory = output.memory
         torque = output.action.mean[:, 0].numpy()
         torque = np.where(driven[:, None], label, torque)
@@ -177,7 +177,7 @@ class Distiller:
             group["lr"] = config.learning_rate * self._schedule()
         output = student(
             jitter_colours(batch["frame"], config.jitter), batch["proprio"], batch["instruction"], batch["terminated"],
-            (batch["h"], batch["c"]), batch["first"],
+            Recurrent(*(batch[f"memory{i}"] for i in range(3))), batch["first"],
         )  # fmt: skip
         loss, stats = imitation_loss(output, self.head, batch, config)
         self.optimiser.zero_grad(set_to_none=True)

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.controller import Gaussian, VisuomotorController
+from mujoban_controller.controller import Gaussian, Recurrent, VisuomotorController
 from mujoban_controller.goal_features import privileged_features
 from mujoban_controller.goal_task import GoalTask, TaskStep
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
-from mujoban_controller.replay import SequenceReplay
+from mujoban_controller.replay import SequenceReplay, memory_fields
 from mujoban_rl.mpo_continuous import MPOConfig, MPOLoss, td_target
 from mujoban_sim.interfaces import Memory, renew_rows
 
@@ -65,7 +65,7 @@ def policy_over(policy: Policy, batch: Mapping[str, Tensor]) -> Gaussian:
     """Return the policy's distributions along sequences, [M, T, U]."""
     if isinstance(policy, PrivilegedPolicy):
         return policy(batch["state"])
-    memory = (batch["h"], batch["c"])
+    memory = Recurrent(*(batch[f"memory{i}"] for i in range(3)))
     inputs = (batch[k] for k in ("frame", "proprio", "instruction", "terminated"))
     return policy(*inputs, memory, batch["first"]).action
 
@@ -82,7 +82,7 @@ class MPOCollector:
 
     def collect(self) -> tuple[dict[str, NDArray], dict[str, NDArray], list[TaskStep]]:
         """Play T ticks; return per-tick fields [T, B, ...], the memory at the start, and what happened."""
-        starts = {name: m.numpy().copy() for name, m in zip(("h", "c"), self._memory, strict=False)}
+        starts = memory_fields(self._memory)
         ticks, steps = [], []
         for _ in range(self.length):
             tick, outcome = self._tick()
@@ -98,7 +98,7 @@ class MPOCollector:
             fresh = self.policy.initial_memory(len(first))
             inputs = task.observe()
             memory = renew_rows(self._memory, fresh, first)
-            output = self.policy(*self.policy.to_tensors(inputs), memory=memory)
+            output = self.policy(*self.policy.to_tensors(inputs), memory=Recurrent(*memory))
             self._memory = output.memory
             action = Gaussian(output.action.mean[:, 0], output.action.scale[:, 0])
             fields = ("frame", "proprio", "instruction", "terminated")

@@ -12,6 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_sim.interfaces import Memory
+
+
+def memory_fields(memory: Memory) -> dict[str, NDArray]:
+    """Return a memory's arrays by name, copied, as per-sequence fields."""
+    return {f"memory{i}": torch.as_tensor(m).detach().cpu().numpy().copy() for i, m in enumerate(memory)}
+
 
 class SequenceReplay:
     """Holds the last C sequences of T ticks; fields are arrays by name, laid out by the first sequences added."""

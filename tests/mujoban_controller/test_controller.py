@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mujoban_controller.controller import VisuomotorController, rows_of_sky
+from mujoban_controller.controller import VisuomotorController, dead_reckoning, rows_of_sky
 from mujoban_rl.weights import WeightsError, load_weights, save_weights
 from mujoban_sim.bodies import BALL, INERTIAL_SIZE
 from mujoban_sim.grid import Instruction
@@ -38,7 +38,7 @@ def test_torques_are_limited_and_shaped_like_the_bodys_actuators(controller):
     assert torque.shape == (3, BALL.action_size)
     assert torque.dtype == np.float32
     assert torque.max() == 1.0
-    assert [m.shape for m in memory] == [(3, 12), (3, 12)]
+    assert [m.shape for m in memory] == [(3, 12), (3, 12), (3, 7)]
 
 
 def test_the_same_inputs_give_the_same_torques_exactly(controller):
@@ -101,7 +101,7 @@ def test_every_instruction_looks_the_same_to_a_robot_that_faces_along_it(control
     steer = INERTIAL_SIZE + BALL.joints.index("steer")
     layer = controller.body_encoder[0]
     joints = len(BALL.joints)
-    angles = layer.in_features - 1 - len(Instruction) - 4 * joints
+    angles = layer.in_features - 1 - len(Instruction) - 6 - 4 * joints
     with torch.no_grad():
         layer.weight[:, angles : angles + 2 * joints] = 0.0
         layer.weight[:, -1 - len(Instruction) : -1] = 0.0
@@ -119,6 +119,19 @@ def test_every_instruction_looks_the_same_to_a_robot_that_faces_along_it(control
     )
     torque, _ = controller.step(turned, controller.initial_memory(4))
     assert torque == pytest.approx(np.repeat(torque[:1], 4, axis=0), abs=1e-5)
+
+
+def test_dead_reckoning_follows_a_drive_round_a_corner():
+    # Two seconds east at 1 m/s, then on the spot to the north, then one second north; velocities in the robot's frame.
+    velocity = torch.tensor([[1.0, 0.0]] * 41 + [[0.0, 0.0]] + [[1.0, 0.0]] * 21)
+    heading = torch.tensor([0.0] * 42 + [np.pi / 2] * 21)
+    track = torch.zeros(1, 7)
+    for t in range(len(velocity)):
+        beta = torch.tensor([t == 41])
+        track = dead_reckoning(track, velocity[t : t + 1], heading[t : t + 1], beta, 0.05)
+    moved, before = track[0, :2].tolist(), track[0, 2:4].tolist()
+    assert moved == pytest.approx([0.0, 1.025], abs=1e-4)
+    assert before == pytest.approx([2.025, 0.0], abs=1e-4)
 
 
 def test_weights_survive_a_round_trip_and_damage_is_noticed(controller, tmp_path):

@@ -45,7 +45,7 @@ def idle(task):
 
 
 def test_a_good_driver_is_rewarded_for_each_instruction():
-    results = play(make(misaligned=0.0), 150)
+    results = play(make(misaligned=0.0, horizon=np.inf), 150)
     outcomes = [o for r in results for o in r.outcomes]
     assert len(outcomes) > 10
     assert all(o.completed for o in outcomes)
@@ -53,7 +53,7 @@ def test_a_good_driver_is_rewarded_for_each_instruction():
 
 
 def test_an_idle_robot_fails_moves_after_the_limit_and_is_given_up_after_some():
-    task = make(planned=1.0, astray=0.0, misaligned=0.0, patience=2)
+    task = make(planned=1.0, astray=0.0, misaligned=0.0, patience=2, horizon=np.inf)
     results = play(task, 240, idle)
     failures = [(t + 1, r) for t, r in enumerate(results) if r.outcomes]
     assert [t for t, _ in failures] == [120, 240]

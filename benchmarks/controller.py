@@ -1,0 +1,182 @@
+"""How long a step of the controller takes, how fast it trains, and whether continuous MPO solves a known problem.
+
+``python -m benchmarks.controller`` prints JSON; ``--pendulum-steps 20000`` adds Gymnasium's ``Pendulum-v1`` learned
+from scratch (solved: a mean return above -250). Step times are processor time of one thread, so that other work on
+the machine hardly changes them.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+
+import gymnasium
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mujoban_controller.controller import Gaussian, VisuomotorController, gaussian, gaussian_layers
+from mujoban_controller.goal_task import GoalTaskConfig
+from mujoban_controller.train import TrainConfig, make_learner
+from mujoban_rl.mpo_continuous import MPOConfig, MPOLoss, td_target
+from mujoban_sim.interfaces import ControllerInput
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure."""
+
+    repeats: int = 200
+    rounds: int = 4
+    """Rounds of collecting and learning to time."""
+    pendulum_steps: int = 0
+    """Environment steps of MPO on Pendulum-v1."""
+    seed: int = 0
+
+
+def milliseconds(step: Callable[[], object], repeats: int) -> float:
+    """Return the median processor time of a step in milliseconds."""
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        step()
+        times.append(time.process_time() - start)
+    return 1e3 * float(np.median(times))
+
+
+def step_time(repeats: int) -> float:
+    """Return the time of one step of the policy with batch 1 in milliseconds."""
+    controller = VisuomotorController().eval()
+    rng = np.random.default_rng(0)
+    frame = rng.integers(0, 256, (1, 64, 64, 3), dtype=np.uint8)
+    proprio = np.zeros((1, controller.proprio_size), np.float32)
+    inputs = ControllerInput(np.array([1]), frame, proprio, np.array([False]))
+    memory = controller.initial_memory(1)
+    return milliseconds(lambda: controller.step(inputs, memory), repeats)
+
+
+def training_rates(rounds: int) -> dict[str, float]:
+    """Return frames per second of processor time of collection with camera, and of learning from them."""
+    learner = make_learner(TrainConfig(task=GoalTaskConfig()))
+    learner.collect()
+    learner.learn()
+    frames, start = learner.frames, time.process_time()
+    for _ in range(rounds):
+        learner.collect()
+    collected = time.process_time()
+    learner.learn()
+    learned = time.process_time()
+    played = learner.frames - frames
+    return {
+        "collected_frames_per_second": played / (collected - start),
+        "learned_frames_per_second": played * learner.config.reuse / (learned - collected),
+    }
+
+
+class _Policy(nn.Module):
+    """A small Gaussian policy with a critic, for problems with few observations."""
+
+    def __init__(self, observations: int, actions: int, width: int = 128) -> None:
+        super().__init__()
+        self.trunk = nn.Sequential(nn.Linear(observations, width), nn.LayerNorm(width), nn.Tanh(),
+                                   nn.Linear(width, width), nn.ELU())  # fmt: skip
+        self.mean, self.scale = gaussian_layers(width, actions)
+        self.critic = nn.Sequential(nn.Linear(observations + actions, width), nn.LayerNorm(width), nn.Tanh(),
+                                    nn.Linear(width, width), nn.ELU(), nn.Linear(width, 1))  # fmt: skip
+
+    def forward(self, observation: Tensor) -> Gaussian:
+        x = self.trunk(observation)
+        return gaussian(self.mean(x), self.scale(x))
+
+    def q(self, observation: Tensor, action: Tensor) -> Tensor:
+        wide = observation.expand(*action.shape[:-1], -1)
+        return self.critic(torch.cat([wide, action.clamp(-1, 1)], -1)).squeeze(-1)
+
+
+class PendulumMPO:
+    """MPO on Pendulum-v1 with torques normalised to [-1, 1]."""
+
+    def __init__(self, seed: int) -> None:
+        """Start from nothing."""
+        torch.manual_seed(seed)
+        self._rng = np.random.default_rng(seed)
+        self._environment = gymnasium.make("Pendulum-v1")
+        self._policy = _Policy(3, 1)
+        self._target = deepcopy(self._policy)
+        self._loss = MPOLoss(1, MPOConfig(epsilon_scale=1e-5))
+        self._optimiser = torch.optim.Adam(self._policy.parameters(), 1e-3)
+        self._duals = torch.optim.Adam(self._loss.parameters(), 1e-2)
+        self._data: list[NDArray[np.float32]] = []
+        self._seed = seed
+        self._updates = 0
+
+    def train(self, steps: int) -> list[float]:
+        """Play `steps` steps, one update after each; return the episodes' returns."""
+        returns = []
+        for episode in range(-(-steps // 200)):
+            returns.append(self.play(explore=True, seed=self._seed + 1000 + episode))
+        return returns
+
+    @torch.no_grad()
+    def _act(self, observation: NDArray[np.float32], explore: bool) -> NDArray[np.float32]:
+        action = self._target(torch.from_numpy(observation))
+        return (action.sample() if explore else action.mean).clamp(-1, 1).numpy()
+
+    def play(self, *, explore: bool, seed: int) -> float:
+        """Play one episode of 200 steps, learning if `explore`; return its return."""
+        observation, _ = self._environment.reset(seed=seed)
+        total = 0.0
+        for _ in range(200):
+            action = self._act(observation, explore)
+            following, reward, *_ = self._environment.step(2.0 * action)
+            if explore:
+                row = np.concatenate([observation, action, [float(reward) / 10], following], dtype=np.float32)
+                self._data.append(row)
+                if len(self._data) > 1000:
+                    self._update()
+            observation, total = following, total + float(reward)
+        return total
+
+    def _update(self, batch: int = 128, samples: int = 20, gamma: float = 0.98) -> None:
+        chosen = self._rng.integers(len(self._data), size=batch)
+        rows = torch.from_numpy(np.stack([self._data[i] for i in chosen]))
+        state, taken, reward, following = rows[:, :3], rows[:, 3:4], rows[:, 4:5], rows[:, 5:]
+        with torch.no_grad():
+            target, ahead = self._target(state), self._target(following)
+            later = ahead.mean + ahead.scale * torch.randn(samples, *ahead.mean.shape)
+            value = td_target(reward, torch.ones_like(reward), self._target.q(following, later).mean(0), gamma)
+            action = target.mean + target.scale * torch.randn(samples, *target.mean.shape)
+            q = self._target.q(state, action)
+        loss, _ = self._loss(self._policy(state), target, action, q)
+        loss = loss + nn.functional.mse_loss(self._policy.q(state, taken), value)
+        self._optimiser.zero_grad()
+        self._duals.zero_grad()
+        loss.backward()
+        self._optimiser.step()
+        self._duals.step()
+        self._loss.limit_duals()
+        self._updates += 1
+        if self._updates % 50 == 0:
+            self._target.load_state_dict(self._policy.state_dict())
+
+
+def main() -> None:
+    """Measure and print."""
+    options = tyro.cli(Options)
+    torch.set_num_threads(1)
+    result: dict[str, object] = {"controller_step_ms": step_time(options.repeats), **training_rates(options.rounds)}
+    if options.pendulum_steps:
+        pendulum = PendulumMPO(options.seed)
+        curve = pendulum.train(options.pendulum_steps)
+        final = [pendulum.play(explore=False, seed=seed) for seed in range(10)]
+        result |= {"pendulum_curve": curve, "pendulum_return": float(np.mean(final))}
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
