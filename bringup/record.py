@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -20,6 +21,7 @@ from rich.progress import Progress
 from bringup.command import Parser, Stack, add_module_options, import_from_here, run_command, stack_from
 from bringup.exploration import Disturbance, disturbed
 from bringup.rollout import ticks
+from mujoban_rl.training import StopSignal
 from mujoban_sim.generator import TRAIN_SEEDS, generate_level
 from mujoban_sim.grid import DIFFICULTIES
 from mujoban_sim.levels import Level
@@ -123,7 +125,7 @@ class Job:
 
 
 def record(job: Job, progress: Progress | None = None) -> int:
-    """Play and record the episodes of a job; return the number of ticks."""
+    """Play and record the episodes of a job, unless a signal asks to stop; return the number of ticks."""
     import torch
 
     from bringup.recording import Recorder
@@ -135,9 +137,12 @@ def record(job: Job, progress: Progress | None = None) -> int:
     world = World(min(job.batch, len(job.episodes)), time_limit=job.time_limit)
     task = None if progress is None else progress.add_task("recorded", total=len(job.episodes))
     difficulties = [job.episodes.difficulty(i) for i in range(len(job.episodes))]
-    with Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix) as recorder:
+    recording = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix)
+    with StopSignal() as stop, recording as recorder:
         for tick in ticks(policy, world, job.episodes, camera=True):
             recorder.write(tick)
+            if stop.requested:
+                break
             ended = int((tick.solved | tick.truncated).sum())
             if progress is not None and task is not None and ended:
                 progress.update(task, advance=ended)
@@ -156,23 +161,13 @@ def main() -> int:
     jobs = [_job(arguments, part) for part in range(min(arguments.processes, arguments.episodes))]
     arguments.out.mkdir(parents=True, exist_ok=True)
     context = multiprocessing.get_context("spawn")
-    with context.Pool(len(jobs) - 1) if len(jobs) > 1 else _NoPool() as pool:
-        others = [pool.apply_async(record, (job,)) for job in jobs[1:]] if pool is not None else []
+    with context.Pool(len(jobs) - 1) if len(jobs) > 1 else nullcontext() as pool:
+        others = [] if pool is None else [pool.apply_async(record, (job,)) for job in jobs[1:]]
         with Progress(console=Console(stderr=True)) as progress:
             total = record(jobs[0], progress)
         total += sum(other.get() for other in others)
     print(f"{total} ticks of {arguments.episodes} episodes in {len(list(arguments.out.iterdir()))} bags")
     return 0
-
-
-class _NoPool:
-    """Stands for a pool where one process does everything."""
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, *_: object) -> None:
-        return None
 
 
 def _arguments() -> argparse.Namespace:
@@ -196,7 +191,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def _job(arguments: argparse.Namespace, part: int) -> Job:
-    """Return what process number `part` records: every so-manieth episode."""
+    """Return what process number `part` records: every `processes`-th episode."""
     processes = min(arguments.processes, arguments.episodes)
     episodes = MixedEpisodes(
         len(range(part, arguments.episodes, processes)), arguments.seed + part, arguments.difficulty,

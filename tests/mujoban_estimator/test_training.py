@@ -5,24 +5,27 @@ import numpy as np
 import pytest
 import torch
 
+from bringup.command import Choice, Stack
 from bringup.exploration import Disturbance
-from bringup.record import MixedEpisodes
+from bringup.record import Job, MixedEpisodes, record
 from bringup.recording import TOPICS as RECORDED
 from bringup.recording import Recorder
 from bringup.rollout import Tick
+from mujoban_estimator import load, load_termination
 from mujoban_estimator.bag_stream import ReadReport, endless, find_bags, open_checked, stretches
 from mujoban_estimator.data import Batcher, Stretch
 from mujoban_estimator.learner import Learner, LearnerConfig, choose_windows
 from mujoban_estimator.losses import missed_steps
 from mujoban_estimator.metrics import MapScores, TerminationScores
 from mujoban_estimator.termination import TerminationConfig
-from mujoban_estimator.train import TrainConfig, learning_rate
+from mujoban_estimator.train import Options, TrainConfig, Trainer, learning_rate
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
 from mujoban_sim.bodies import BALL
 from mujoban_sim.generator import TRAIN_SEEDS
 from mujoban_sim.grid import Instruction
 from mujoban_sim.interfaces import GroundTruth, Observation, TerminationOutput
+from mujoban_sim.plugins import ROLES
 from mujoban_sim.sense_plan_act import Decision
 
 SEED = TRAIN_SEEDS.start
@@ -257,3 +260,16 @@ def test_the_command_names_a_bad_bag_in_one_line(tmp_path):
     command = [sys.executable, "-m", "mujoban_estimator.train", "--bags", str(tmp_path), "--run", str(tmp_path / "run")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "no bag in" in done.stderr
+
+
+def test_what_is_recorded_can_be_learned_from_and_learning_goes_on_where_it_stopped(tmp_path):
+    stack = Stack({role: Choice(role, "oracle") for role in ROLES})
+    job = Job(tmp_path / "bags", "", MixedEpisodes(2, SEED, [1]), stack, Disturbance(), 2, 24, 0)
+    assert record(job) == sum(t.count for b in find_bags([job.out]) for t in [open_checked(b).topics["/pose"]])
+    config = TrainConfig(LearnerConfig(window_frames=8), streams=1, length=8, steps=2)
+    options = Options((job.out,), tmp_path / "run", (job.out,), out=tmp_path / "weights", config=config, workers=0)
+    Trainer(options).train()
+    assert Trainer(options).step == 2
+    estimator = load(tmp_path / "weights" / "estimator.safetensors")
+    assert estimator.config == config.learner.estimator
+    assert load_termination(tmp_path / "weights" / "termination.safetensors").limit == 120
