@@ -1,0 +1,139 @@
+"""Speed of the planner: latency of one decision and training throughput, as JSON (`python benchmarks/planner.py`)."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from mujoban_planner import SHIPPED, load
+from mujoban_planner.abstract_env import AbstractEnvironment
+from mujoban_planner.boards import abstract_states
+from mujoban_planner.imitation import ImitationConfig, imitation_loss
+from mujoban_planner.lessons import LessonMaker
+from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner
+from mujoban_planner.samples import SampleBuffer, make_batch
+from mujoban_planner.symmetry import SYMMETRIES
+from mujoban_planner.teacher import Teacher
+from mujoban_sim.generator import generate_batch
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to measure, and for how long."""
+
+    seconds: float = 3.0
+    """Seconds per measurement."""
+    device: str = "cpu"
+    """Device of training and of the abstract environment; decisions are measured on the CPU."""
+    threads: int = 1
+    """Threads on a CPU."""
+
+
+def rate(step: Callable[[], object], seconds: float, device: str = "cpu") -> float:
+    """Return calls per second after a warm-up."""
+    for _ in range(3):
+        step()
+    _wait(device)
+    start, calls = time.perf_counter(), 0
+    while time.perf_counter() - start < seconds:
+        step()
+        calls += 1
+    _wait(device)
+    return calls / (time.perf_counter() - start)
+
+
+def decision_milliseconds(planner: LearnedPlanner, seconds: float) -> dict[str, float]:
+    """Return median and 99th percentile of the time of one decision for one robot."""
+    states = abstract_states(generate_batch(5, range(16)))
+    memory = planner.initial_state(np.zeros(1, np.int64)).memory
+    times: list[float] = []
+    start = time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        before = time.perf_counter()
+        _, memory = planner.decide(states[len(times) % 16][None], memory)
+        times.append(1e3 * (time.perf_counter() - before))
+    median, tail = np.percentile(times[5:], [50, 99])
+    return {"median_ms": float(median), "p99_ms": float(tail)}
+
+
+def training_samples_per_second(config: ImitationConfig, options: Options) -> float:
+    """Return imitation samples per second, forward and backward, on ready samples."""
+    network = config.build().to(options.device)
+    adam = torch.optim.AdamW(network.parameters(), 1e-4, fused=True)
+    buffer = SampleBuffer(50_000)
+    buffer.add(LessonMaker(0, {5: 1.0}).demonstrations(64))
+    rng = np.random.default_rng(0)
+
+    def step() -> None:
+        batch = make_batch(buffer.draw(config.batch_size, rng), rng.integers(0, SYMMETRIES, config.batch_size))
+        with torch.autocast(torch.device(options.device).type, torch.bfloat16):
+            loss, _ = imitation_loss(network, batch.to(options.device), config)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+
+    return config.batch_size * rate(step, options.seconds, options.device)
+
+
+def environment_steps_per_second(options: Options, batch: int = 4096) -> float:
+    """Return instructions per second of the abstract environment."""
+    environment = AbstractEnvironment(batch, device=options.device)
+    states = torch.from_numpy(abstract_states(generate_batch(5, range(batch))))
+    environment.reset_to(torch.arange(batch), states)
+    instruction = torch.randint(1, 5, (batch,), generator=torch.Generator().manual_seed(0)).to(options.device)
+    return batch * rate(lambda: environment.step(instruction), options.seconds, options.device)
+
+
+def demonstrations_per_second(options: Options) -> float:
+    """Return labelled levels per second and core, generation included."""
+    teacher, rng, seeds = Teacher(), np.random.default_rng(0), iter(range(0, 10_000_000, 64))
+
+    def step() -> None:
+        first = next(seeds)
+        teacher.demonstrate(generate_batch(5, range(first, first + 64)), rng)
+
+    return 64 * rate(step, options.seconds)
+
+
+def main() -> None:
+    """Print the figures as JSON."""
+    options = tyro.cli(Options)
+    torch.set_num_threads(options.threads)
+    shipped = load(SHIPPED)
+    result: dict[str, Any] = {
+        "decision": {
+            f"shipped ({type(shipped).__name__})": decision_milliseconds(shipped, options.seconds),
+            "RecurrentPlanner": decision_milliseconds(RecurrentPlanner().eval(), options.seconds),
+        },
+        "training_samples_per_second": {
+            "residual 64x8": training_samples_per_second(ImitationConfig(), options),
+            "residual 48x8": training_samples_per_second(ImitationConfig(channels=48), options),
+            "recurrent 32, DRC(3,3)": training_samples_per_second(
+                ImitationConfig(architecture="recurrent", channels=32, propagation=False), options
+            ),
+        },
+        "environment_steps_per_second": environment_steps_per_second(options),
+        "demonstrated_levels_per_second": demonstrations_per_second(options),
+        "device": options.device,
+        "threads": options.threads,
+        "torch": torch.__version__,
+    }
+    json.dump(result, sys.stdout, indent=2)
+    print()
+
+
+def _wait(device: str) -> None:
+    if torch.device(device).type == "cuda":
+        torch.cuda.synchronize()
+
+
+if __name__ == "__main__":
+    main()
