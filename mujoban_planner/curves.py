@@ -1,0 +1,64 @@
+"""Draw learning curves of runs: `python -m mujoban_planner.curves RUN... --out docs/planner_curves.png`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import matplotlib
+import tyro
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+
+@dataclass(frozen=True)
+class Options:
+    """Solve rate on held-out levels over samples and over time."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Run directories."""
+    out: Path = Path("docs/planner_curves.png")
+    """Image to write."""
+    difficulty: int = 5
+    """Difficulty whose solve rate is drawn."""
+
+
+def read_curve(run: Path, difficulty: int) -> list[tuple[float, float, float]]:
+    """Return (step, seconds, solve rate) of each evaluation of a run.
+
+    Raises:
+        OSError: If the run has no metrics.
+    """
+    lines = (json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines())
+    key = f"solve_rate/{difficulty}"
+    return [(line["step"], line["seconds"], line[key]) for line in lines if key in line]
+
+
+def main() -> None:
+    """Run the command line."""
+    options = tyro.cli(Options)
+    try:
+        curves = {run.name: read_curve(run, options.difficulty) for run in options.runs}
+    except OSError as error:
+        print(f"curves: {error}; expected run directories of a trainer", file=sys.stderr)
+        sys.exit(2)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
+    for name, curve in curves.items():
+        for axis, column, scale in ((axes[0], 0, 1e3), (axes[1], 1, 60.0)):
+            axis.plot([point[column] / scale for point in curve], [point[2] for point in curve], ".-", label=name)
+    axes[0].set(xlabel="thousand samples (MPO: updates)", ylabel=f"solve rate, difficulty {options.difficulty}")
+    axes[1].set(xlabel="minutes of training")
+    for axis in axes:
+        axis.grid(alpha=0.3)
+        axis.set_ylim(0.0, 1.0)
+    axes[0].legend()
+    figure.tight_layout()
+    figure.savefig(options.out, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
