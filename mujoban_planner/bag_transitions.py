@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_estimator.bag_stream import find_bags
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_planner.abstract_env import STEP_REWARD
@@ -37,12 +38,12 @@ class BagTransitions(NamedTuple):
 
     @classmethod
     def read(cls, bags: Sequence[Path], device: torch.device | str = "cpu") -> BagTransitions:
-        """Read the transitions of bags.
+        """Read the transitions of bags, or of folders of bags.
 
         Raises:
             ValueError: If a bag is damaged, lacks a topic, or no transition is found.
         """
-        found = [row for bag in bags for row in transitions(open_bag(bag).ticks(_TOPICS))]
+        found = [row for bag in find_bags(bags) for row in transitions(open_bag(bag).ticks(_TOPICS))]
         if not found:
             raise ValueError(f"{', '.join(map(str, bags))}: no completed instruction, expected bags of played episodes")
         states, instructions, rewards, successors, terminated = zip(*found, strict=True)

@@ -24,7 +24,8 @@ from torch.nn import functional
 from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.planner import INSTRUCTIONS, LearnedPlanner
+from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.teacher import DISCOUNT
 from mujoban_planner.validation import NetworkConfig, solve_rates
 from mujoban_rl.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
 from mujoban_rl.replay import TimeMajorReplay, windowed_returns
@@ -51,7 +52,7 @@ class MPOConfig(NetworkConfig):
     """Steps before the first update."""
     batch_size: int = 256
     n_step: int = 5
-    discount: float = 0.99
+    discount: float = DISCOUNT
     learning_rate: float = 1e-4
     dual_learning_rate: float = 1e-2
     target_period: int = 100
@@ -281,10 +282,10 @@ class MPOTrainer:
 
 @torch.no_grad()
 def reset_stay_logit(network: LearnedPlanner) -> None:
-    """Let a network that imitated, and never saw STAY, treat it as the mean of the moves.
+    """Let a network that imitated, and never saw STAY, treat it as little less than the mean of the moves.
 
     Its logit was pushed to where exploration would never find out what STAY is worth.
     """
-    for head in (network.heads.policy,):
-        head.weight[Instruction.STAY] = head.weight[1:INSTRUCTIONS].mean(0)
-        head.bias[Instruction.STAY] = head.bias[1:INSTRUCTIONS].mean() - 2.0
+    head = network.heads.policy
+    head.weight[Instruction.STAY] = head.weight[1:].mean(0)
+    head.bias[Instruction.STAY] = head.bias[1:].mean() - 2.0
