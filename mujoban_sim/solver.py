@@ -217,6 +217,8 @@ def _checked(batch: LevelBatch) -> LevelBatch:
     np.add.at(occupied, (owner, cells[:, 0], cells[:, 1]), 1)
     if (occupied > 1).any():
         raise ValueError("two things in one cell: expected boxes and player in cells of their own")
+    if not present.any(1).all():
+        raise ValueError("a level without boxes: expected at least one")
     if (batch.target & batch.wall).any() or (batch.target.sum((1, 2)) != present.sum(1)).any():
         raise ValueError("targets and boxes differ in number, or a target is in a wall: expected as many as boxes")
     return batch

@@ -127,7 +127,7 @@ def assignment(boxes: Bits, distance: NDArray[np.int64], best: NDArray[np.int64]
     Args:
         boxes: K boxes.
         distance: pushes to each target, [S, K].
-        best: scratch, [2^K] for K <= `MAX_ASSIGNED`.
+        best: scratch, [2^K + K] for K <= `MAX_ASSIGNED`.
     """
     k_boxes = distance.shape[1]
     if k_boxes > MAX_ASSIGNED:
@@ -137,24 +137,21 @@ def assignment(boxes: Bits, distance: NDArray[np.int64], best: NDArray[np.int64]
             boxes &= boxes - ONE
         return total
     # best[used]: the first |used| boxes assigned to the set `used` of targets.
-    best[:] = 2 * _INFINITE
     best[0] = 0
-    for used in range((1 << k_boxes) - 1):
-        base = best[used]
-        if base >= _INFINITE:
-            continue
-        rest = boxes
-        members = used
-        while members:
-            rest &= rest - ONE
-            members &= members - 1
-        square = lowest(rest)
-        for goal in range(k_boxes):
-            if not used >> goal & 1:
-                total = base + distance[square, goal]
-                if total < best[used | 1 << goal]:
-                    best[used | 1 << goal] = total
-    return best[-1]
+    squares = best[1 << k_boxes :]
+    for k in range(k_boxes):
+        squares[k] = lowest(boxes)
+        boxes &= boxes - ONE
+    for used in range(1, 1 << k_boxes):
+        square = squares[count(np.uint64(used)) - 1]
+        least = 2 * _INFINITE
+        members = np.uint64(used)
+        while members != NONE:
+            goal = lowest(members)
+            members &= members - ONE
+            least = min(least, best[used ^ (1 << goal)] + distance[square, goal])
+        best[used] = least
+    return np.int64(best[(1 << k_boxes) - 1])
 
 
 @njit(cache=True, nogil=True)
@@ -225,7 +222,7 @@ def search(
     distance = push_distances(floor, target)
     dead = dead_squares(distance)
     wall = ~floor
-    scratch = np.empty(1 << min(distance.shape[1], MAX_ASSIGNED), np.int64)
+    scratch = np.empty((1 << min(distance.shape[1], MAX_ASSIGNED)) + distance.shape[1], np.int64)
     bound = assignment(boxes, distance, scratch)
     estimate = int(weight * bound)
     if bound >= _INFINITE or estimate >= _BUCKETS:

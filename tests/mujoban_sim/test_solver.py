@@ -250,7 +250,8 @@ def test_compiled_code_is_shared_by_concurrent_processes():
     [
         ({"wall": np.zeros((1, 10, 10), bool)}, "open boundary"),
         ({"player": np.array([[0, 0]])}, "player outside"),
-        ({"boxes": np.array([[[-1, -1]]])}, "expected as many"),
+        ({"boxes": np.array([[[-1, -1]]])}, "without boxes"),
+        ({"target": np.zeros((1, 10, 10), bool)}, "expected as many"),
         ({"player": np.zeros((2, 2), np.int64)}, r"\[B, 2\]"),
     ],
 )
