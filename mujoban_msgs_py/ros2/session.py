@@ -1,0 +1,186 @@
+"""A node of the command's own, waiting for the graph, and what verbs ask of it."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Final, Self
+
+import rclpy
+from rclpy.executors import Executor
+from rclpy.experimental import EventsExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+DISCOVERY_LIMIT: Final = 5.0
+"""Seconds within which what exists has been discovered."""
+QUIET_TIME: Final = 0.7
+"""Seconds without a change after which the graph counts as discovered."""
+STEP: Final = 0.05
+"""Seconds for which the executor may wait without looking at interruptions."""
+
+
+class CommandError(ValueError):
+    """A command was asked for something that cannot be done; the message is one line."""
+
+
+class Session:
+    """A hidden node that is spun as long as a verb needs it."""
+
+    def __init__(self, options: argparse.Namespace, *, sim_time: bool = False) -> None:
+        """Remember how long to wait for discovery.
+
+        Args:
+            options: Parsed options; `spin_time` is how long to look around, None for as long as it takes.
+            sim_time: Whether the node's clock follows /clock.
+        """
+        self._spin_time: float | None = getattr(options, "spin_time", None)
+        self._sim_time = sim_time
+
+    def __enter__(self) -> Self:
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        overrides = [Parameter("use_sim_time", value=True)] if self._sim_time else []
+        name = f"_ros2cli_{os.getpid()}"
+        self.node = rclpy.create_node(
+            name, enable_rosout=False, start_parameter_services=False, parameter_overrides=overrides
+        )
+        self.executor: Executor = EventsExecutor()
+        self.executor.add_node(self.node)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.node.destroy_node()
+        rclpy.shutdown()
+
+    def until(self, done: Callable[[], bool], timeout: float | None = DISCOVERY_LIMIT) -> bool:
+        """Spin until `done` or for `timeout` seconds (None: for ever); returns whether it is done."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while not done():
+            rest = STEP if end is None else min(STEP, end - time.monotonic())
+            if rest <= 0:
+                return False
+            self.executor.spin_once(timeout_sec=rest)
+        return True
+
+    def spin_for(self, seconds: float) -> None:
+        """Spin for some time."""
+        self.until(lambda: False, seconds)
+
+    def settle(self, graph: Callable[[], Any]) -> Any:
+        """Return what `graph` says once others are there and it has stopped changing, or after `--spin-time`."""
+        if self._spin_time is not None:
+            self.spin_for(self._spin_time)
+            return graph()
+        end = time.monotonic() + DISCOVERY_LIMIT
+        seen, since = graph(), time.monotonic()
+        while time.monotonic() < end and (self._alone() or time.monotonic() < since + QUIET_TIME):
+            self.spin_for(STEP)
+            now = graph()
+            if now != seen:
+                seen, since = now, time.monotonic()
+        return seen
+
+    def _alone(self) -> bool:
+        """Return whether no other node has been discovered yet."""
+        return all(name == self.node.get_name() for name in self.node.get_node_names())
+
+    def wait_for(self, found: Callable[[], bool], complaint: str) -> None:
+        """Spin until something has been discovered.
+
+        Raises:
+            CommandError: With `complaint` if it is not within the time for discovery.
+        """
+        limit = DISCOVERY_LIMIT if self._spin_time is None else self._spin_time
+        if not self.until(found, limit):
+            raise CommandError(complaint)
+
+    def topic_type(self, topic: str, complaint: str | None = None) -> str:
+        """Return the type of a topic once it has been discovered.
+
+        Raises:
+            CommandError: If there is no such topic.
+        """
+        self.wait_for(
+            lambda: topic in dict(self.node.get_topic_names_and_types()), complaint or f"unknown topic '{topic}'"
+        )
+        return dict(self.node.get_topic_names_and_types())[topic][0]
+
+
+def full_name(name: str) -> str:
+    """Return a name with its leading slash."""
+    return name if name.startswith("/") else f"/{name}"
+
+
+def is_hidden(name: str) -> bool:
+    """Return whether a part of a name begins with an underscore, or a topic belongs to a service."""
+    return any(part.startswith("_") for part in name.split("/"))
+
+
+def import_type(name: str, kind: str) -> type[Any]:
+    """Return the class of an interface such as `std_msgs/msg/Header`.
+
+    Raises:
+        CommandError: If the name is malformed or there is no such interface.
+    """
+    parts = name.split("/")
+    if len(parts) == 2:
+        parts.insert(1, kind)
+    if len(parts) != 3 or parts[1] != kind:
+        raise CommandError(f"'{name}' is not a type: expected package/{kind}/Type")
+    try:
+        return getattr(importlib.import_module(f"{parts[0]}.{kind}"), parts[2])
+    except (ImportError, AttributeError):
+        raise CommandError(f"the type '{name}' is unknown: no installed package has it") from None
+
+
+def add_discovery_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options about discovery that the genuine command has."""
+    parser.add_argument(
+        "--spin-time", type=float, metavar="SPIN_TIME", help="Seconds to wait for discovery (default: until it settles)"
+    )
+    parser.add_argument("--no-daemon", action="store_true", help="Accepted for compatibility: there is no daemon")
+
+
+def add_qos_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options about quality of service that the genuine command has."""
+    parser.add_argument("--qos-depth", type=int, metavar="N", help="Queue size setting")
+    parser.add_argument("--qos-history", choices=["keep_last", "keep_all"], help="History of samples setting")
+    parser.add_argument("--qos-reliability", choices=["reliable", "best_effort"], help="Reliability setting")
+    parser.add_argument("--qos-durability", choices=["volatile", "transient_local"], help="Durability setting")
+
+
+def choose_qos(options: argparse.Namespace, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
+    """Return the profile that the options ask for; what they leave open is `reliable` and `latched`."""
+    if options.qos_reliability:
+        reliable = options.qos_reliability == "reliable"
+    if options.qos_durability:
+        latched = options.qos_durability == "transient_local"
+    profile = make_qos(options.qos_depth or 10, reliable=reliable, latched=latched)
+    if options.qos_history == "keep_all":
+        profile.history = HistoryPolicy.KEEP_ALL
+    return profile
+
+
+def make_qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
+    """Return a profile that keeps the last `depth` messages."""
+    return QoSProfile(
+        depth=depth,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def qos_of_publishers(session: Session, topic: str) -> tuple[bool, bool]:
+    """Return whether all publishers of a topic are reliable, and whether all are latched."""
+    profiles = [info.qos_profile for info in session.node.get_publishers_info_by_topic(topic)]
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    latched = bool(profiles) and all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return reliable, latched

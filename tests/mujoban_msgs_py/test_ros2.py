@@ -1,0 +1,248 @@
+"""The `ros2` command, run as a user runs it, against real nodes."""
+
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.bags import BagWriter, open_bag
+from mujoban_msgs_py.ros2.main import environment_outside, other_command
+from mujoban_msgs_py.ros2.messages import fill, to_csv, to_yaml
+from mujoban_msgs_py.ros2.session import CommandError
+
+COMMAND = [sys.executable, "-m", "mujoban_msgs_py.ros2.main"]
+
+
+def start(*arguments):
+    return subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ros2(*arguments, status=0):
+    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == status, done.stderr
+    return done.stdout if status == 0 else done.stderr
+
+
+@pytest.fixture(scope="module")
+def talker():
+    """A node with parameters and a service that publishes a pose 50 times a second."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("talker", context=context)
+    node.declare_parameter("speed", 1.5)
+    node.declare_parameter("name", "ball")
+    pose = node.create_publisher(topics.POSE.type, topics.POSE.name, topics.POSE.qos)
+    episode = node.create_publisher(topics.EPISODE.type, topics.EPISODE.name, topics.EPISODE.qos)
+    reading = conversions.EpisodeReading(7, 1, 5, "#@#", 0, 0.0, 0.0, False, False, False, 0)
+    episode.publish(conversions.episode_to_msg(conversions.header(5), reading))
+    node.heard = []
+    node.create_subscription(String, "/chatter", lambda m: node.heard.append(m.data), 10)
+    node.count = 0
+
+    def publish():
+        node.count += 1
+        pose.publish(conversions.pose_to_msg(conversions.header(node.count * topics.TICK, "map"), (1.0, 2.0, 0.0)))
+
+    def serve(request, response):
+        response.success, response.message = request.data, f"was asked {request.data}"
+        return response
+
+    node.create_timer(0.02, publish)
+    node.create_service(SetBool, "/pause", serve)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+
+    def spin():
+        with suppress(ExternalShutdownException):
+            executor.spin()
+
+    thread = threading.Thread(target=spin, daemon=True)
+    thread.start()
+    yield node
+    executor.shutdown()
+    thread.join(10)
+    node.destroy_node()
+    context.try_shutdown()
+
+
+def test_lists_topics_with_their_types(talker):
+    assert {"/chatter", "/episode", "/pose"} <= set(ros2("topic", "list").splitlines())
+    assert "/pose [geometry_msgs/msg/PoseStamped]" in ros2("topic", "list", "-t").splitlines()
+
+
+def test_info_counts_publishers_and_names_them(talker):
+    text = ros2("topic", "info", "-v", "/pose")
+    assert text.startswith("Type: geometry_msgs/msg/PoseStamped\n\nPublisher count: 1\n\nNode name: talker\n")
+    assert "Reliability: RELIABLE" in text and "Subscription count: 0" in text
+
+
+def test_echo_prints_yaml_fields_and_csv(talker):
+    text = ros2("topic", "echo", "--once", "/pose")
+    assert re.match(r"header:\n  stamp:\n    sec: \d+\n    nanosec: \d+\n  frame_id: map\npose:\n  position:\n", text)
+    assert text.endswith("    w: 1.0\n---\n")
+    assert ros2("topic", "echo", "--once", "--field", "pose.position", "/pose") == "x: 1.0\ny: 2.0\nz: 0.0\n---\n"
+    assert ros2("topic", "echo", "--once", "--csv", "/pose").endswith("map,1.0,2.0,0.0,0.0,0.0,0.0,1.0\n")
+
+
+def test_echo_receives_what_a_latched_topic_said_earlier(talker):
+    assert ros2("topic", "echo", "--once", "--field", "episode", "/episode") == "7\n---\n"
+
+
+def test_hz_measures_the_rate(talker):
+    process = start("topic", "hz", "/pose")
+    lines = [process.stdout.readline() for _ in range(2)]
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 130
+    rate = float(re.fullmatch(r"average rate: (\d+\.\d{3})\n", lines[0])[1])
+    assert 10 < rate < 60
+    assert re.fullmatch(r"\tmin: \d\.\d{3}s max: \d\.\d{3}s std dev: \d\.\d{5}s window: \d+\n", lines[1])
+
+
+def test_pub_reaches_a_subscriber(talker):
+    text = ros2("topic", "pub", "--once", "/chatter", "std_msgs/msg/String", "{data: hello}")
+    assert "publisher: beginning loop\npublishing #1: std_msgs.msg.String(data='hello')\n" in text
+    assert talker.heard == ["hello"]
+
+
+def test_nodes_are_listed_and_described(talker):
+    assert "/talker" in ros2("node", "list").splitlines()
+    text = ros2("node", "info", "/talker")
+    assert text.startswith("/talker\n  Subscribers:\n    /chatter: std_msgs/msg/String\n")
+    assert "    /pose: geometry_msgs/msg/PoseStamped\n" in text and "    /pause: std_srvs/srv/SetBool\n" in text
+
+
+def test_parameters_are_listed_read_and_set(talker):
+    assert {"  speed", "  name"} <= set(ros2("param", "list", "/talker").splitlines())
+    assert ros2("param", "get", "/talker", "speed") == "Double value is: 1.5\n"
+    assert ros2("param", "set", "/talker", "speed", "2.5") == "Set parameter successful\n"
+    assert talker.get_parameter("speed").value == 2.5
+    assert "Setting parameter failed" in ros2("param", "set", "/talker", "speed", "fast", status=2)
+
+
+def test_services_are_listed_and_called(talker):
+    assert "/pause [std_srvs/srv/SetBool]" in ros2("service", "list", "-t").splitlines()
+    text = ros2("service", "call", "/pause", "std_srvs/srv/SetBool", "{data: true}")
+    assert "requester: making request: std_srvs.srv.SetBool_Request(data=True)\n\nresponse:\n" in text
+    assert "std_srvs.srv.SetBool_Response(success=True, message='was asked True')" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["topic", "info", "/nothing", "--spin-time", "0.2"], "ros2: error: unknown topic '/nothing'"),
+        (["topic", "echo", "/nothing", "--spin-time", "0.2"], "does not appear to be published yet"),
+        (["topic", "pub", "/x", "std_msgs/msg/Nothing"], "the type 'std_msgs/msg/Nothing' is unknown"),
+        (["topic", "pub", "/x", "std_msgs/msg/String", "{dat: 1}"], "String has no field 'dat': expected one of data"),
+        (["topic", "pub", "/x", "std_msgs/msg/String", "{data: 1}"], "1 does not fit field 'data' of type string"),
+        (["node", "info", "/nobody", "--spin-time", "0.2"], "unable to find node '/nobody'"),
+        (["bag", "info", "/nowhere"], "no bag at /nowhere"),
+        (["bag", "record"], "nothing to record"),
+        (["topic", "fly"], "invalid choice: 'fly'"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(arguments, expected):
+    assert expected in ros2(*arguments, status=2)
+
+
+def test_records_until_interrupted(talker, tmp_path):
+    process = start("bag", "record", "-o", str(tmp_path / "bag"), "/pose", "/episode")
+    end = time.monotonic() + 30
+    while talker.count < 1 or "Subscribed to topic '/pose'" not in process.stderr.readline():
+        assert time.monotonic() < end
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(20) == 0
+    bag = open_bag(tmp_path / "bag")
+    stamps = [t.stamp for t in bag.ticks([topics.POSE])]
+    assert len(stamps) > 20 and set(np.diff(stamps)) == {topics.TICK}
+    assert bag.topics["/episode"].count == 1
+
+
+@pytest.fixture
+def bag(tmp_path) -> Path:
+    from rclpy.serialization import serialize_message
+
+    with BagWriter(tmp_path / "bag", [topics.POSE, topics.EPISODE]) as writer:
+        for tick in range(1, 41):
+            message = conversions.pose_to_msg(conversions.header(tick * topics.TICK), (tick, 0.0, 0.0))
+            writer.write(topics.POSE.name, tick * topics.TICK, serialize_message(message))
+    return tmp_path / "bag"
+
+
+def test_info_describes_a_bag(bag):
+    lines = ros2("bag", "info", str(bag)).splitlines()
+    assert lines[1] == "Files:             bag_0.mcap"
+    assert lines[5] == "Duration:          1.950s"
+    assert lines[8] == "Messages:          40"
+    pose = "Topic: /pose | Type: geometry_msgs/msg/PoseStamped | Count: 40 | Serialization Format: cdr"
+    assert lines[10] == " " * 19 + pose
+
+
+def test_plays_every_message_to_a_node_that_listens(ros, bag):
+    node = ros.create_node("listener")
+    heard, clock = [], []
+    node.create_subscription(topics.POSE.type, "/replayed", heard.append, topics.POSE.qos)
+    node.create_subscription(topics.CLOCK.type, topics.CLOCK.name, clock.append, topics.CLOCK.qos)
+    process = start("bag", "play", str(bag), "-r", "4", "--clock", "--topics", "/pose", "-m", "/pose:=/replayed")
+    while process.poll() is None:
+        ros.spin_once(node, timeout_sec=0.05)
+    assert process.returncode == 0, process.stderr.read()
+    ros.spin_once(node, timeout_sec=0.2)
+    assert [conversions.pose_from_msg(m)[0] for m in heard] == list(range(1, 41))
+    times = [conversions.stamp_of(m) for m in clock]
+    assert len(times) > 5 and times == sorted(times) and times[-1] <= 40 * topics.TICK
+
+
+def test_a_damaged_bag_is_described_with_a_warning_and_reindexed(bag):
+    file = bag / "bag_0.mcap"
+    file.write_bytes(file.read_bytes()[:-30])
+    assert "is truncated" in ros2("bag", "play", str(bag), status=2)
+    done = subprocess.run([*COMMAND, "bag", "info", bag], capture_output=True, text=True, check=True)
+    assert "warning: bag_0.mcap is truncated" in done.stderr and "Messages:          40" in done.stdout
+    ros2("bag", "reindex", str(bag))
+    assert len(list(open_bag(bag).messages())) == 40
+
+
+def test_long_arrays_are_truncated_unless_asked_for():
+    message = conversions.frame_to_msg(conversions.header(1), np.zeros((64, 64, 3), np.uint8))
+    assert to_yaml(message).endswith("- 0\n- '...'\n") and to_yaml(message).count("- 0\n") == 128
+    assert to_yaml(message, truncate=None).count("- 0\n") == 64 * 64 * 3
+    assert "data: '<sequence type: sequence<uint8>, length: 12288>'" in to_yaml(message, no_arr=True)
+    assert to_csv(conversions.torque_to_msg(conversions.header(1), [0.5, -0.5])).endswith("0.5,-0.5")
+
+
+def test_fields_are_filled_from_nested_values():
+    pose = topics.POSE.type()
+    fill(pose, {"header": {"frame_id": "map"}, "pose": {"position": {"x": 3}}})
+    assert (pose.header.frame_id, pose.pose.position.x) == ("map", 3.0)
+    torque = topics.TORQUE.type()
+    fill(torque, {"effort": [1, 0.5], "name": ["a", "b"]})
+    assert list(torque.effort) == [1.0, 0.5]
+    with pytest.raises(CommandError, match="no field 'q'"):
+        fill(pose, {"pose": {"q": 1}})
+
+
+def test_the_genuine_command_is_found_and_gets_a_clean_environment(tmp_path):
+    own, genuine = tmp_path / "own" / "ros2", tmp_path / "opt" / "ros2"
+    for file, text in ((own, "from mujoban_msgs_py.ros2.main import main"), (genuine, "from ros2cli import main")):
+        file.parent.mkdir()
+        file.write_text(text)
+        file.chmod(0o755)
+    assert other_command(f"{own.parent}:{genuine.parent}", own) == genuine
+    assert other_command(f"{own.parent}", Path("elsewhere")) is None
+    clean = environment_outside(
+        {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1", "LD_LIBRARY_PATH": f"{sys.prefix}/lib:/opt/ros/lib"}, Path(sys.prefix)
+    )
+    assert clean == {"LD_LIBRARY_PATH": "/opt/ros/lib"}
