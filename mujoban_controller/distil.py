@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_controller.controller import ControllerOutput, Recurrent, VisuomotorController
-from mujoban_controller.drivers import Driver
+from mujoban_controller.drivers import Driver, WanderingDriver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask, TaskStep
 from mujoban_controller.replay import SequenceReplay, memory_fields
@@ -42,8 +42,12 @@ class DistilConfig:
     reuse: float = 3.0
     """Times that each frame is trained on, on average."""
     warm_up: int = 100_000
-    """Frames over which the share of rows that the teacher drives falls from one to `teacher_share`."""
-    teacher_share: float = 0.3
+    """Frames over which the share of rows that the student does not drive falls from one to `guided`."""
+    guided: float = 0.3
+    """Share of rows that the scripted driver drives, with targets that wander: positions that a student needs to tell
+    apart before it is good, and has left behind once it is."""
+    wander: float = 0.12
+    """Standard deviation of these targets in cells."""
     noise: float = 0.1
     """Deviation of the noise on the torques of a third of the rows, which shows the student more states."""
     learning_rate: float = 1e-3
@@ -109,6 +113,7 @@ class Collector:
     ) -> None:  # fmt: skip
         """Collect from `task` with randomness from `rng`."""
         self.task, self.student, self.teacher, self.config, self._rng = task, student, teacher, config, rng
+        self._guide = WanderingDriver(rng, config.wander)
         b = task.world.batch
         self._memory: Memory = student.initial_memory(b)
         self.frames = 0
@@ -118,7 +123,7 @@ class Collector:
         """Play T ticks; return per-tick fields [T, B, ...], the memory at the start, and what happened."""
         b = self.task.world.batch
         share = 1.0 - self.frames / max(self.config.warm_up, 1)
-        driven = self._rng.random(b) < max(share, self.config.teacher_share)
+        driven = self._rng.random(b) < max(share, self.config.guided)
         noisy = self._rng.random(b) < 1 / 3
         starts = memory_fields(self._memory)
         rows, steps = [], []
@@ -138,7 +143,7 @@ class Collector:
         output = self.student(*self.student.to_tensors(inputs), memory=Recurrent(*self._memory))
         self._memory = output.memory
         torque = output.action.mean[:, 0].numpy()
-        torque = np.where(driven[:, None], label, torque)
+        torque = np.where(driven[:, None], self._guide(task), torque)
         torque = torque + noisy[:, None] * self._rng.normal(0.0, self.config.noise, torque.shape)
         goals = task.world.goals
         tick = {

@@ -76,7 +76,7 @@ def random_instruction(
 class TerminationConfig:
     """How termination signals differ from the rule of paper C.4."""
 
-    late: float = 0.2
+    late: float = 0.1
     """Share of instructions whose signal comes late."""
     delay: float = 5.0
     """Mean number of ticks by which it does; until then the robot has to hold."""
