@@ -41,6 +41,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--record", type=Path, metavar="DIR", help="record all topics into a bag")
     parser.add_argument("--episodes-per-file", type=positive, default=32, metavar="N", help="of the bag")
     parser.add_argument("--video", type=Path, metavar="FILE", help="write an .mp4 of the robot's view and from above")
+    parser.add_argument("--view", action="store_true", help="serve a live view (Rerun) to the browser")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there")
     return parser.parse_args(arguments)
 
@@ -66,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         record=options.record,
         episodes_per_file=options.episodes_per_file,
         video=options.video,
+        view=options.view,
     )
     if options.headless:
         outcome = play(stack, episodes, play_options)

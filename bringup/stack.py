@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import rclpy
@@ -45,6 +48,8 @@ class PlayOptions:
     """Episodes in one file of the bag."""
     video: Path | None = None
     """Video file to write."""
+    view: bool = False
+    """Serve a live view to the browser, from a process of its own."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +105,8 @@ def play(
             listeners.append(graph.add(_recorder(options.record, options.episodes_per_file)))
         if options.video is not None:
             listeners.append(graph.add(VideoNode(options.video)))
+        if options.view:
+            exits.enter_context(viewer())
         if options.processes:
             processes = exits.enter_context(Processes(parameters))
             monitor.create_timer(RESPAWN_PERIOD, processes.supervise)
@@ -116,6 +123,23 @@ def _drain(executor: Executor, listeners: Sequence[RecorderNode | VideoNode], st
     deadline = time.monotonic() + DRAIN_TIMEOUT
     while any(listener.written < stamp for listener in listeners) and time.monotonic() < deadline:
         executor.spin_once(timeout_sec=0.05)
+
+
+@contextmanager
+def viewer() -> Iterator[None]:
+    """Run `bringup.live` in a process of its own: drawing must not hold up the graph.
+
+    Raises:
+        ValueError: If Rerun is not installed.
+    """
+    if find_spec("rerun") is None:
+        raise ValueError("the live view needs rerun-sdk: pip install 'mujoban[view]'")
+    process = subprocess.Popen([sys.executable, "-m", "bringup.live"])
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def _recorder(path: Path, episodes_per_file: int) -> RecorderNode:
