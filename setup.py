@@ -11,7 +11,7 @@ HERE = Path(__file__).resolve().parent
 PACKAGES = ("mujoban_*", "bringup*", "benchmarks*")
 
 sys.path.insert(0, str(HERE / "mujoban_msgs_py"))
-from interface_build import PACKAGE, extension  # noqa: E402
+from interface_build import PACKAGE, extension  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 if not (shutil.which("gcc") or shutil.which("cc")):
     sys.exit("setup.py: error: no C compiler to build the ROS messages with: apt-get install gcc g++")
