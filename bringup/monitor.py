@@ -3,47 +3,50 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from mujoban_msgs.msg import AbstractState, Episode, Instruction, Termination
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 
 from bringup.failure import EpisodeLog
-from bringup.raw import raw_stamp
 from bringup.results import EpisodeResult
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.tick_node import live_qos
 
 _WATCHED = (topics.INSTRUCTION, topics.TERMINATION, topics.ABSTRACT_STATE, topics.TRUE_ABSTRACT_STATE)
-_RAW = (topics.ABSTRACT_STATE, topics.TRUE_ABSTRACT_STATE)
-"""Topics whose messages are decoded only when they are looked at."""
 
 
-@dataclass(frozen=True)
-class Watched:
-    """What the modules said in the latest tick."""
+class Watched(NamedTuple):
+    """What the modules said in the latest tick; decoded where it is looked at."""
 
-    instruction: Instruction
-    termination: Termination
-    _estimate: bytes
-    _truth: bytes
+    raw: dict[str, bytes]
+    """Topic name -> message."""
+
+    @property
+    def instruction(self) -> conversions.InstructionReading:
+        """A."""
+        return read(self.raw[topics.INSTRUCTION.name], Instruction, conversions.instruction_from_msg)
+
+    @property
+    def termination(self) -> conversions.TerminationReading:
+        """Beta."""
+        return read(self.raw[topics.TERMINATION.name], Termination, conversions.termination_from_msg)
 
     @property
     def estimate(self) -> NDArray[np.float32]:
         """Estimated abstract state, [N, N, 4]."""
-        return _decode(self._estimate)
+        return read(self.raw[topics.ABSTRACT_STATE.name], AbstractState, conversions.abstract_state_from_msg)
 
     @property
     def truth(self) -> NDArray[np.float32]:
         """True abstract state, [N, N, 4]."""
-        return _decode(self._truth)
+        return read(self.raw[topics.TRUE_ABSTRACT_STATE.name], AbstractState, conversions.abstract_state_from_msg)
 
 
 class MonitorNode(Node):
@@ -73,10 +76,9 @@ class MonitorNode(Node):
         self._joined = -1
         self._end: Episode | None = None
         qos = live_qos(depth=1024)
-        self.create_subscription(Episode, topics.EPISODE.name, self._on_episode, qos)
+        self.create_subscription(Episode, topics.EPISODE.name, self._on_episode, qos, raw=True)
         for topic in _WATCHED:
-            raw = topic in _RAW
-            self.create_subscription(topic.type, topic.name, self._receiver(topic, raw), qos, raw=raw)
+            self.create_subscription(topic.type, topic.name, partial(self._receive, topic.name), qos, raw=True)
 
     @property
     def stamp(self) -> int:
@@ -89,21 +91,17 @@ class MonitorNode(Node):
         seconds = self._ended - self._started
         return self.ticks / seconds if seconds > 0 else 0.0
 
-    def _receiver(self, topic: topics.Topic, raw: bool) -> Callable[[Any], None]:
-        stamp_of = raw_stamp if raw else conversions.stamp_of
+    def _receive(self, name: str, message: bytes) -> None:
+        stamp = raw_stamp(message)
+        if stamp <= self._joined:
+            return
+        joined = self._join.add(name, stamp, message)
+        if joined is not None:
+            self._joined = stamp
+            self._on_tick(Watched(joined))
 
-        def receive(message: Any) -> None:
-            stamp = stamp_of(message)
-            if stamp <= self._joined:
-                return
-            joined = self._join.add(topic.name, stamp, message)
-            if joined is not None:
-                self._joined = stamp
-                self._on_tick(Watched(*(joined[t.name] for t in _WATCHED)))
-
-        return receive
-
-    def _on_episode(self, message: Episode) -> None:
+    def _on_episode(self, raw: bytes) -> None:
+        message = read(raw, Episode)
         if self._end is not None:
             self._finish()
         self._started = self._started or time.perf_counter()
@@ -119,9 +117,10 @@ class MonitorNode(Node):
     def _on_tick(self, tick: Watched) -> None:
         self.latest = tick
         self.ticks += 1
-        if tick.instruction.sequence != self._sequence:
-            self._sequence = tick.instruction.sequence
-            self._log.decided(tick.truth, tick.estimate, tick.instruction.direction, tick.termination.timed_out)
+        said = tick.instruction
+        if said.sequence != self._sequence:
+            self._sequence = said.sequence
+            self._log.decided(tick.truth, tick.estimate, said.direction, tick.termination.timed_out)
         self._finish_when_joined()
 
     def _finish_when_joined(self) -> None:
@@ -136,7 +135,3 @@ class MonitorNode(Node):
         self.results.append(self._log.result(solved=end.solved, steps=end.step, episode_return=end.episode_return))
         if len(self.results) == self._episodes:
             self.finished.set_result(None)
-
-
-def _decode(message: bytes) -> NDArray[np.float32]:
-    return conversions.abstract_state_from_msg(deserialize_message(message, AbstractState))

@@ -11,11 +11,10 @@ from typing import Any
 from mujoban_msgs.msg import Episode
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 
-from bringup.raw import raw_stamp
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
+from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
 
@@ -82,7 +81,7 @@ class RecorderNode(Node):
         return receive
 
     def _note_end(self, stamp: int, message: bytes) -> None:
-        episode = deserialize_message(message, Episode)
+        episode = read(message, Episode)
         if episode.terminated or episode.truncated:
             self._last_ticks.add(stamp)
 

@@ -16,6 +16,7 @@ from rclpy.parameter import Parameter
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.module_node import ModuleNode
+from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.tick_node import Input, Output, run_node
 from mujoban_sim.interfaces import NO_INSTRUCTION, GroundTruth, TerminationInput
 
@@ -46,7 +47,7 @@ class TerminationNode(ModuleNode):
         for name in _SETTINGS:
             setattr(self.module, name, self.declare_parameter(name, getattr(self.module, name)).value)
         topic = topics.INSTRUCTION
-        self.create_subscription(topic.type, topic.name, self._on_instruction, topic.qos)
+        self.create_subscription(topic.type, topic.name, self._on_instruction, topic.qos, raw=True)
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
         """Start the state and forget the instructions of the episode before."""
@@ -89,10 +90,10 @@ class TerminationNode(ModuleNode):
         earlier = [s for s in self._said if s < stamp]
         return self._said[max(earlier)] if earlier else None
 
-    def _on_instruction(self, message: Instruction) -> None:
-        stamp = conversions.stamp_of(message)
+    def _on_instruction(self, message: bytes) -> None:
+        stamp = raw_stamp(message)
         try:
-            said = conversions.instruction_from_msg(message)
+            said = read(message, Instruction, conversions.instruction_from_msg)
         except ValueError as error:
             self.reject("rejected messages", f"rejected a message on {topics.INSTRUCTION.name}: {error}")
             return

@@ -11,7 +11,7 @@ from std_msgs.msg import Header
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.topics import Topic
 from mujoban_sim.camera import camera_intrinsics
-from mujoban_sim.world import World
+from mujoban_sim.world import EpisodeSpec, World
 
 _NEEDED = (topics.EPISODE, topics.CAMERA, topics.PROPRIO, topics.POSE)
 """What the modules cannot do without."""
@@ -43,6 +43,8 @@ class ObservationPublisher:
         self._world = world
         self._top_camera_size = top_camera_size
         self._joints = list(world.body.joints)
+        self._spec: EpisodeSpec | None = None
+        self._level_text = ""
         self._intrinsics = camera_intrinsics(world.body.camera)
         self._publishers = {t: node.create_publisher(t.type, t.name, t.qos) for t in topics.SIMULATOR_TOPICS}
         self._composers: dict[Topic, Callable[[TickLabel], Any]] = {
@@ -77,11 +79,13 @@ class ObservationPublisher:
         spec = world.episodes[0]
         if spec is None:
             raise RuntimeError("no episode has been started")
+        if spec is not self._spec:
+            self._spec, self._level_text = spec, spec.level.to_text()
         reading = conversions.EpisodeReading(
             episode=label.episode,
             seed=spec.seed,
             difficulty=label.difficulty,
-            level=spec.level.to_text(),
+            level=self._level_text,
             step=int(world.steps[0]),
             reward=world.reward[0],
             episode_return=world.episode_return[0],

@@ -24,7 +24,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
-from mujoban_msgs_py.conversions import stamp_of
+from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import EPISODE, Topic
 
@@ -40,8 +40,8 @@ class Input(NamedTuple):
     """A topic that a node needs in every tick."""
 
     topic: Topic
-    decode: Callable[[Any], Any]
-    """Turns the message into what the node works with; a ValueError rejects the message."""
+    decode: Callable[[Any], Any] | None
+    """Turns the message into what the node works with, if given; a ValueError rejects the message."""
 
 
 class Output(NamedTuple):
@@ -89,10 +89,11 @@ class TickNode(Node):
 
     def open_inputs(self, inputs: Sequence[Input]) -> None:
         """Subscribe to `/episode` and to what `answer` needs besides."""
-        every = [Input(EPISODE, as_it_is), *inputs]
+        every = [Input(EPISODE, None), *inputs]
         self._join = Synchroniser([i.topic.name for i in every])
         for topic, decode in every:
-            self.create_subscription(topic.type, topic.name, partial(self._receive, topic, decode), topic.qos)
+            receive = partial(self._receive, topic, decode)
+            self.create_subscription(topic.type, topic.name, receive, topic.qos, raw=True)
 
     def create_output(self, topic: Topic) -> Publisher:
         """Return a publisher of a topic."""
@@ -115,19 +116,21 @@ class TickNode(Node):
         self.counts[kind] += 1
         self.get_logger().error(reason, throttle_duration_sec=LOG_PERIOD)
 
-    def _receive(self, topic: Topic, decode: Callable[[Any], Any], message: Any) -> None:
+    def _receive(self, topic: Topic, decode: Callable[[Any], Any] | None, message: bytes) -> None:
         if self._destroyed:
             return
-        stamp = stamp_of(message)
-        if topic is EPISODE:
-            self._note_offer(stamp, message)
-        if stamp <= self._handled:
+        stamp = raw_stamp(message)
+        if stamp <= self._handled and topic is not EPISODE:
             return
         try:
-            item = decode(message)
+            item = read(message, topic.type, decode)
         except ValueError as error:
             self.reject("rejected messages", f"rejected a message on {topic.name}: {error}")
             return
+        if topic is EPISODE:
+            self._note_offer(stamp, item)
+            if stamp <= self._handled:
+                return
         assert self._join is not None
         complete = self._join.add(topic.name, stamp, item)
         if complete is not None:
@@ -150,11 +153,6 @@ class TickNode(Node):
     def _publish(self) -> None:
         for publisher, message in self._outputs:
             publisher.publish(message)
-
-
-def as_it_is(message: Any) -> Any:
-    """Return the message: the `decode` of inputs that need none."""
-    return message
 
 
 def live_qos(depth: int = 64) -> QoSProfile:

@@ -22,6 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.observation import ObservationPublisher, TickLabel
+from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.tick_node import LOG_PERIOD, live_qos, run_node
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.episodes import Episodes
@@ -137,9 +138,9 @@ class SimulatorNode(Node):
         )
 
     def _listen(self) -> None:
-        self.create_subscription(JointState, topics.TORQUE.name, self._on_torque, topics.TORQUE.qos)
+        self.create_subscription(JointState, topics.TORQUE.name, self._on_torque, topics.TORQUE.qos, raw=True)
         # What a planner said before this simulator came must not arrive.
-        self.create_subscription(Instruction, topics.INSTRUCTION.name, self._on_instruction, live_qos())
+        self.create_subscription(Instruction, topics.INSTRUCTION.name, self._on_instruction, live_qos(), raw=True)
         if self._settings["await_recorder"]:
             self.create_subscription(Header, topics.RECORDED.name, self._on_recorded, topics.RECORDED.qos)
         self.create_service(Trigger, "/reset", self._on_reset)
@@ -259,12 +260,12 @@ class SimulatorNode(Node):
 
     # Answers
 
-    def _on_torque(self, message: JointState) -> None:
-        stamp = conversions.stamp_of(message)
+    def _on_torque(self, message: bytes) -> None:
+        stamp = raw_stamp(message)
         if not self._is_known(stamp, topics.TORQUE.name):
             return
         try:
-            torque = conversions.torque_from_msg(message, self.world.body.action_size)
+            torque = conversions.torque_from_msg(read(message, JointState), self.world.body.action_size)
         except ValueError as error:
             self._reject("rejected torques", f"rejected a torque, zero is held instead: {error}")
             torque = np.zeros_like(self._held_torque)
@@ -274,12 +275,12 @@ class SimulatorNode(Node):
         elif self._speed > 0 and self._torque is None:
             self._held_torque = torque
 
-    def _on_instruction(self, message: Instruction) -> None:
-        stamp = conversions.stamp_of(message)
+    def _on_instruction(self, message: bytes) -> None:
+        stamp = raw_stamp(message)
         if not self._is_known(stamp, topics.INSTRUCTION.name):
             return
         try:
-            instruction = conversions.instruction_from_msg(message)
+            instruction = read(message, Instruction, conversions.instruction_from_msg)
         except ValueError as error:
             self._reject("rejected instructions", f"rejected an instruction: {error}")
             return

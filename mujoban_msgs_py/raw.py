@@ -1,0 +1,46 @@
+"""Serialised messages: what can be read off them without deserialising, and deserialising each only once.
+
+Nodes that share a process receive the same bytes: the camera's image goes to three of them, `/episode` to all.
+Deserialising costs more than anything else in rclpy, so it is done for the first and remembered for the others.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+from rclpy.serialization import deserialize_message
+
+_LITTLE_ENDIAN = 1
+_ENCAPSULATION = 4
+"""Bytes before the first field of a message in CDR."""
+_REMEMBERED = 64
+"""Messages of about four ticks."""
+
+
+def raw_stamp(message: bytes) -> int:
+    """Return the stamp [ns] of a serialised message whose first field is a header or a time.
+
+    Raises:
+        ValueError: If the message is too short to hold one.
+    """
+    if len(message) < _ENCAPSULATION + 8:
+        raise ValueError(f"a serialised message of {len(message)} bytes holds no stamp")
+    order = "<" if message[1] & _LITTLE_ENDIAN else ">"
+    second, nanosecond = struct.unpack_from(order + "iI", message, _ENCAPSULATION)
+    return second * 1_000_000_000 + nanosecond
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def read(message: bytes, kind: type[Any], decode: Callable[[Any], Any] | None = None) -> Any:
+    """Return what a serialised message holds; the result is shared, so leave it as it is.
+
+    Args:
+        message: CDR, as raw subscriptions deliver it.
+        kind: Type of the message.
+        decode: Applied to the message, if given; what it raises passes through.
+    """
+    content = deserialize_message(message, kind)
+    return content if decode is None else decode(content)
