@@ -66,7 +66,7 @@ class MonitorNode(Node):
         self.episode: Episode | None = None
         self.latest: Watched | None = None
         self.results: list[EpisodeResult] = []
-        self.finished: Future[None] = Future()
+        self.finished = Future()
         self.ticks = 0
         self._episodes = episodes
         self._started = self._ended = 0.0

@@ -47,7 +47,7 @@ class RecorderNode(Node):
         """
         super().__init__("recorder", **options)
         fixed = ParameterDescriptor(read_only=True)
-        path = self.declare_parameter("path", "bag", fixed).value
+        path: Any = self.declare_parameter("path", "bag", fixed).value
         episodes_per_file = self.declare_parameter("episodes_per_file", 32, fixed).value
         self.counts: Counter[str] = Counter()
         self._bag = BagWriter(Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file)

@@ -65,7 +65,7 @@ def ticks(
     rows = np.arange(min(world.batch, len(episodes)))
     episode = rows.copy()
     step = np.zeros(len(rows), np.int64)
-    seeds = np.array([episodes[i].seed for i in episode], np.int64)
+    seeds = np.array([episodes[i].seed for i in episode.tolist()], np.int64)
     state = policy.initial_state(seeds)
     camera = needs_camera(policy) if camera is None else camera
     torque = np.zeros((world.batch, world.body.action_size), np.float32)
@@ -94,8 +94,8 @@ def ticks(
             episode[m] = -1 if following is None else following
         renewed = ended & ~finished
         if renewed.any():
-            world.reset(rows[renewed], [episodes[i] for i in episode[renewed]])
-            seeds[renewed] = [episodes[i].seed for i in episode[renewed]]
+            world.reset(rows[renewed], [episodes[i] for i in episode[renewed].tolist()])
+            seeds[renewed] = [episodes[i].seed for i in episode[renewed].tolist()]
             state = renew_rows(state, policy.initial_state(seeds), renewed)
             step[renewed] = 0
         kept = np.flatnonzero(~finished)

@@ -49,9 +49,10 @@ class ModuleNode(TickNode):
             ValueError: If the module or its weights cannot be loaded.
         """
         super().__init__(self.role, **options)
-        self._source: str = self.declare_parameter("module", LEARNED, ParameterDescriptor(read_only=True)).value
-        weights = self.declare_parameter("weights", "").value
-        device = self.declare_parameter("device", "cpu").value
+        source: Any = self.declare_parameter("module", LEARNED, ParameterDescriptor(read_only=True)).value
+        self._source: str = source
+        weights: Any = self.declare_parameter("weights", "").value
+        device: Any = self.declare_parameter("device", "cpu").value
         self.module: Any = self._load(weights, device)
         self.state: Any = None
         self._episode = -1
@@ -87,7 +88,8 @@ class ModuleNode(TickNode):
         changed = {p.name: p.value for p in parameters}
         if not changed.keys() & {"weights", "device"}:
             return SetParametersResult(successful=True)
-        weights, device = (changed.get(n, self.get_parameter(n).value) for n in ("weights", "device"))
+        current: dict[str, Any] = {name: self.get_parameter(name).value for name in ("weights", "device")}
+        weights, device = (changed.get(name, value) for name, value in current.items())
         try:
             self.module = self._load(weights, device)
         except (ValueError, OSError, RuntimeError) as error:

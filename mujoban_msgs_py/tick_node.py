@@ -165,7 +165,7 @@ def confine_discovery() -> None:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
-def spin(executor: Executor, until: Future[Any]) -> None:
+def spin(executor: Executor, until: Future) -> None:
     """Run an executor until a future is done.
 
     An `EventsExecutor` must be given a deadline: without one it waits until the end of its clock, which overflows,

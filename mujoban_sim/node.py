@@ -95,10 +95,12 @@ class SimulatorNode(Node):
         """
         super().__init__("simulator", **options)
         self.counts: Counter[str] = Counter()
-        self.finished: Future[None] = Future()
+        self.finished = Future()
         self.ticks = 0
         fixed = ParameterDescriptor(read_only=True)
-        self._settings = {name: self.declare_parameter(name, value, fixed).value for name, value in PARAMETERS.items()}
+        self._settings: dict[str, Any] = {
+            name: self.declare_parameter(name, value, fixed).value for name, value in PARAMETERS.items()
+        }
         self.episodes = self._read_episodes()
         self.world = World(
             1,
