@@ -1,5 +1,6 @@
 # make setup  .venv with everything in it          make lint   ruff and pyright
 # make run    one episode with a live view         make bench  measurements, as JSON
+# make results  the tables and figures of the paper
 # make test   the test suite
 #
 # PYTHON chooses the interpreter for .venv; ARGS are passed on, as in: make run ARGS="--difficulty 1"
@@ -10,7 +11,7 @@ STAMP := .venv/.installed
 INPUTS := pyproject.toml setup.py mujoban_msgs_py/interface_build.py $(wildcard mujoban_msgs_py/msg/*.msg)
 ARGS ?=
 
-.PHONY: setup run test lint bench clean
+.PHONY: setup run test lint bench results clean
 
 setup: $(STAMP)
 
@@ -29,6 +30,9 @@ test: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/pyright
+
+results: $(STAMP)
+	$(BIN)/python -m benchmarks.paper
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks $(ARGS)
