@@ -30,6 +30,7 @@ from mujoban_sim.grid import Instruction as Direction
 
 ENCODING: Final = "rgb8"
 _SECOND: Final = 1_000_000_000
+_ROUNDED_PI: Final = float(np.float32(math.pi))
 _INERTIAL: Final = ("linear_velocity", "angular_velocity", "linear_acceleration")
 
 
@@ -155,12 +156,16 @@ def pose_to_msg(header: Header, pose: ArrayLike) -> PoseStamped:
 
 
 def pose_from_msg(message: Any) -> NDArray[np.float32]:
-    """Return (x [m], y [m], psi [rad]), [3]; psi in [-pi, pi]."""
+    """Return (x [m], y [m], psi [rad]), [3]; psi in [-pi, pi], as far as float32 has these bounds."""
     p, q = message.pose.position, message.pose.orientation
     norm = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w
     if not abs(norm - 1.0) < 1e-3:
         raise ConversionError(f"orientation must be a unit quaternion, got ({q.x}, {q.y}, {q.z}, {q.w})")
-    yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
+    if q.x == q.y == 0.0 and abs(half := math.atan2(q.z, q.w)) < _ROUNDED_PI / 2 + 1e-9:
+        # Exact for a robot that stands upright, also at -pi and pi as float32 rounds them: just outside [-pi, pi].
+        yaw = 2 * half
+    else:
+        yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
     return _finite("pose", (p.x, p.y, yaw), (3,), np.float32)
 
 

@@ -62,7 +62,7 @@ def test_proprioception_round_trips(proprio):
     assert_round_trip(message, c.proprio_from_msg, proprio)
 
 
-@given(finite, finite, st.floats(-3.125, 3.125, width=32))
+@given(finite, finite, st.floats(-float(np.float32(math.pi)), float(np.float32(math.pi)), width=32))
 def test_poses_round_trip_exactly(x, y, yaw):
     pose = np.array([x, y, yaw], np.float32)
     message = c.pose_to_msg(HEADER, pose)
