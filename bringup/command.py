@@ -22,6 +22,8 @@ from mujoban_sim.solver import Status, solve_levels
 
 USAGE_ERROR = 2
 """Exit status of a command whose input was bad."""
+INTERRUPTED = 130
+"""Exit status of a command that was asked to end, as shells have it."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -40,7 +42,8 @@ def run_command(prog: str, command: Callable[[], int]) -> NoReturn:
         print(f"{prog}: error: {' '.join(str(error).split())}", file=sys.stderr)
         status = USAGE_ERROR
     except KeyboardInterrupt:
-        status = 130
+        print(f"{prog}: interrupted", file=sys.stderr)
+        status = INTERRUPTED
     sys.exit(status)
 
 

@@ -24,7 +24,7 @@ from bringup.parameters import graph_parameters
 from bringup.recorder import RecorderNode
 from bringup.results import EpisodeResult
 from bringup.video import EDGE, VideoNode
-from mujoban_msgs_py.tick_node import confine_discovery, spin
+from mujoban_msgs_py.tick_node import init_ros, spin
 from mujoban_sim.camera import FRAME_SIZE
 from mujoban_sim.episodes import Episodes
 
@@ -83,6 +83,7 @@ def play(
     Raises:
         ValueError: If a module cannot be loaded.
         GraphError: If a node's process could not start.
+        KeyboardInterrupt: If the process was asked to end; bag and video are whole then.
     """
     options = options or PlayOptions()
     parameters = graph_parameters(
@@ -93,10 +94,9 @@ def play(
         await_recorder=options.record is not None,
         top_camera_size=FRAME_SIZE if options.video is None else EDGE,
     )
-    confine_discovery()
     with ExitStack() as exits:
         exits.enter_context(claim_domain())
-        rclpy.init()
+        init_ros()
         exits.callback(rclpy.try_shutdown)
         graph = exits.enter_context(InProcess(parameters, () if options.processes else NODES))
         monitor = graph.add(MonitorNode(len(episodes)))

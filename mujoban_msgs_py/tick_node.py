@@ -8,20 +8,24 @@ neighbour which was restarted in between receives what it has missed.
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
 import rclpy
 from mujoban_msgs.msg import Episode
-from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from mujoban_msgs_py.raw import raw_stamp, read
@@ -160,19 +164,48 @@ def live_qos(depth: int = 64) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 
 
-def confine_discovery() -> None:
-    """Keep discovery on this host unless the environment says otherwise; call before `rclpy.init`."""
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-
-
 def spin(executor: Executor, until: Future) -> None:
     """Run an executor until a future is done.
 
     An `EventsExecutor` must be given a deadline: without one it waits until the end of its clock, which overflows,
-    and then polls at full load while its other threads starve. Between two deadlines signals are looked after.
+    and then polls at full load while its other threads starve. Between two deadlines signals are looked after: a
+    callback that has begun is never cut short.
+
+    Raises:
+        KeyboardInterrupt: If the process was asked to end, by SIGINT or SIGTERM.
     """
-    while not until.done():
-        executor.spin_until_future_complete(until, timeout_sec=SIGNAL_PERIOD)
+    with _signals() as received:
+        while not until.done():
+            executor.spin_until_future_complete(until, timeout_sec=SIGNAL_PERIOD)
+            if received:
+                raise KeyboardInterrupt
+
+
+def confine_discovery() -> None:
+    """Keep discovery on this host unless the environment says otherwise; call before rclpy is initialised."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+def init_ros(args: Sequence[str] | None = None) -> None:
+    """Initialise rclpy for `spin`, which looks after signals itself; discovery stays on this host."""
+    confine_discovery()
+    rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Note SIGINT and SIGTERM in a list; in other threads than the main one there are none to note."""
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+    kinds = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(kind, lambda number, _: received.append(number)) for kind in kinds]
+    try:
+        yield received
+    finally:
+        for kind, handler in zip(kinds, before, strict=True):
+            signal.signal(kind, handler)
 
 
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
@@ -185,15 +218,14 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     Returns:
         Exit status: 0, or 2 after one line on stderr about bad input.
     """
-    confine_discovery()
-    rclpy.init(args=None if args is None else list(args))
+    init_ros(args)
     node = None
     try:
         node = make()
         executor = EventsExecutor()
         executor.add_node(node)
         spin(executor, Future())
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         pass
     except (ValueError, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -1,13 +1,20 @@
 """The commands: what they write, and one line on stderr with exit status 2 for bad input."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from functools import partial
+from pathlib import Path
 
 import imageio.v2 as imageio
 import pytest
 
 from bringup import evaluate, run_stack
 from bringup.command import run_command
+from mujoban_msgs_py.bags import open_bag
+from mujoban_msgs_py.topics import GRAPH_TOPICS
 from mujoban_sim import rendering
 from mujoban_sim.levels import Level, write_levels
 
@@ -121,3 +128,17 @@ def test_without_opengl_the_commands_say_what_to_install(monkeypatch, capfd):
     monkeypatch.setattr(rendering, "open_context", no_context)
     assert run(run_stack, "--headless", "--difficulty", 1, *ALL_ORACLES) == 2
     assert "error: cannot open an OpenGL context: install the Debian packages libegl1" in capfd.readouterr().err
+
+
+def test_an_interrupted_run_leaves_a_whole_bag(tmp_path):
+    bag = tmp_path / "bag"
+    command = [sys.executable, "bringup/run_stack.py", "--headless", *ALL_ORACLES, "--record", str(bag)]
+    root = Path(run_stack.__file__).parents[1]
+    process = subprocess.Popen(command, cwd=root, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not (bag / "metadata.yaml").is_file() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and err.strip().endswith("interrupted")
+    assert {m.topic for m in open_bag(bag).messages()} <= set(GRAPH_TOPICS)
