@@ -24,7 +24,7 @@ from bringup.parameters import graph_parameters
 from bringup.recorder import RecorderNode
 from bringup.results import EpisodeResult
 from bringup.video import EDGE, VideoNode
-from mujoban_msgs_py.tick_node import init_ros, spin
+from mujoban_msgs_py.tick_node import init_ros, noted_signals, spin
 from mujoban_sim.camera import FRAME_SIZE
 from mujoban_sim.episodes import Episodes
 
@@ -95,6 +95,7 @@ def play(
         top_camera_size=FRAME_SIZE if options.video is None else EDGE,
     )
     with ExitStack() as exits:
+        received = exits.enter_context(noted_signals())
         exits.enter_context(claim_domain())
         init_ros()
         exits.callback(rclpy.try_shutdown)
@@ -112,7 +113,7 @@ def play(
             monitor.create_timer(RESPAWN_PERIOD, processes.supervise)
         if on_refresh is not None:
             monitor.create_timer(refresh_period, lambda: on_refresh(monitor, monitor.results))
-        spin(graph.executor, monitor.finished)
+        spin(graph.executor, monitor.finished, received)
         _drain(graph.executor, listeners, monitor.stamp)
         counts = processes.restarts if options.processes else graph.counts()
         return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts)

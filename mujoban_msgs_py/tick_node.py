@@ -164,21 +164,25 @@ def live_qos(depth: int = 64) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 
 
-def spin(executor: Executor, until: Future) -> None:
+def spin(executor: Executor, until: Future, received: Sequence[int]) -> None:
     """Run an executor until a future is done.
 
     An `EventsExecutor` must be given a deadline: without one it waits until the end of its clock, which overflows,
     and then polls at full load while its other threads starve. Between two deadlines signals are looked after: a
     callback that has begun is never cut short.
 
+    Args:
+        executor: With its nodes.
+        until: The future.
+        received: Signals that asked the process to end, from `noted_signals`.
+
     Raises:
         KeyboardInterrupt: If the process was asked to end, by SIGINT or SIGTERM.
     """
-    with _signals() as received:
-        while not until.done():
-            executor.spin_until_future_complete(until, timeout_sec=SIGNAL_PERIOD)
-            if received:
-                raise KeyboardInterrupt
+    while not until.done():
+        if received:
+            raise KeyboardInterrupt
+        executor.spin_until_future_complete(until, timeout_sec=SIGNAL_PERIOD)
 
 
 def confine_discovery() -> None:
@@ -193,8 +197,8 @@ def init_ros(args: Sequence[str] | None = None) -> None:
 
 
 @contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Note SIGINT and SIGTERM in a list; in other threads than the main one there are none to note."""
+def noted_signals() -> Iterator[list[int]]:
+    """Note SIGINT and SIGTERM in a list instead of heeding them; threads but the main one have none to note."""
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield received
@@ -221,10 +225,11 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     init_ros(args)
     node = None
     try:
-        node = make()
-        executor = EventsExecutor()
-        executor.add_node(node)
-        spin(executor, Future())
+        with noted_signals() as received:
+            node = make()
+            executor = EventsExecutor()
+            executor.add_node(node)
+            spin(executor, Future(), received)
     except KeyboardInterrupt:
         pass
     except (ValueError, OSError) as error:
