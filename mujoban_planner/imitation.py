@@ -17,7 +17,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_planner import load
 from mujoban_planner.lessons import LessonMaker, LessonProcess
+from mujoban_planner.planner import LearnedPlanner, input_planes
+from mujoban_planner.propagation import shifted
 from mujoban_planner.samples import Batch, SampleBuffer, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.validation import NetworkConfig, solve_rates
@@ -54,6 +57,10 @@ class ImitationConfig(NetworkConfig):
     """Decay of the averaged weights, which are what is played and shipped."""
     corrections: float = 0.5
     """Share of a batch that corrects the planner's own play (DAgger), once there is some."""
+    trials: int = 12
+    """Wrong pushes tried out per demonstration."""
+    init: str | None = None
+    """Weights to start from, where names and shapes agree."""
     noise: float = 0.1
     """Share of a batch whose abstract states are made uncertain, as estimates are."""
     mix: dict[int, float] = field(default_factory=lambda: {1: 0.03, 2: 0.04, 3: 0.06, 4: 0.12, 5: 0.75})
@@ -81,6 +88,8 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: ImitationConfig) ->
     known = batch.dead_known.float()
     dead = functional.binary_cross_entropy_with_logits(output.dead, batch.dead.float(), weight=known, reduction="sum")
     dead = dead / known.sum().clamp(min=1)
+    if output.push_dead is not None:
+        dead = dead + _push_verdicts(output.push_dead.flatten(1), batch, shown)
     q_known = (batch.right | batch.dead).float()
     q_target = torch.where(batch.dead, -1.0, batch.value[:, None])
     q = functional.smooth_l1_loss(output.q, q_target, reduction="none")
@@ -96,6 +105,25 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: ImitationConfig) ->
     parts = {"policy": policy, "accuracy": accuracy, "push": push, "push_accuracy": best.sum() / n}
     parts |= {"plan": plan, "dead": dead, "dead_recall": caught, "q": q}
     return loss, {k: v.detach() for k, v in parts.items()}
+
+
+def _push_verdicts(push_dead: Tensor, batch: Batch, shown: Tensor) -> Tensor:
+    """Return the cross-entropy of the verdicts on pushes, [B, 4 * I * I], deadly ones and others alike in weight.
+
+    Known are the pushes next to the robot that were tried or shown, and the next push of a demonstration.
+    """
+    index = batch.adjacent_pushes()
+    floor, _, agent, box = input_planes(batch.state).unbind(1)
+    beside = (shifted(box) * agent[:, None]).sum((2, 3)) > 0.5  # Shape [B, 4]
+    pushable = torch.minimum(shifted(torch.minimum(floor, 1.0 - box)), box[:, None]).flatten(1) > 0.5
+    known = batch.dead_known[:, 1:] & ~batch.dead[:, :1] & beside & pushable.gather(1, index)
+    logits = torch.cat([push_dead.gather(1, index), push_dead.gather(1, batch.next_push[:, None])], 1)
+    known = torch.cat([known, shown[:, None]], 1)
+    dead = torch.cat([batch.dead[:, 1:], torch.zeros_like(shown[:, None])], 1)
+    loss = functional.binary_cross_entropy_with_logits(logits, dead.float(), reduction="none")
+    deadly, harmless = (known & dead).float(), (known & ~dead).float()
+    halves = [(loss * w).sum() / w.sum().clamp(min=1.0) for w in (deadly, harmless)]
+    return halves[0] + halves[1]
 
 
 def make_uncertain(state: Tensor, share: float, generator: torch.Generator) -> Tensor:
@@ -146,6 +174,8 @@ class ImitationTrainer:
         self.directory = RunDirectory(directory, config)
         torch.manual_seed(config.seed)  # the initial weights
         self.network = config.build().to(self.device)
+        if config.init is not None:
+            start_from(self.network, Path(config.init))
         _convolutions_channels_last(self.network)
         self.average = copy.deepcopy(self.network).eval()
         self.optimiser = torch.optim.AdamW(
@@ -164,9 +194,9 @@ class ImitationTrainer:
         self._process: LessonProcess | None = None
         stream = 1000 * config.seed + self.bits
         if processes:
-            self._process = LessonProcess(stream, config.mix, self.played_weights, niceness=5)
+            self._process = LessonProcess(stream, config.mix, config.trials, self.played_weights, niceness=5)
         else:
-            self._maker = LessonMaker(stream, config.mix)
+            self._maker = LessonMaker(stream, config.mix, config.trials)
 
     def run(self, *, seconds: float | None, samples: float, evaluate_every: float, save_every: float) -> None:
         """Train until the schedule ends, for `seconds`, up to `samples`, or until a signal; then save."""
@@ -311,6 +341,17 @@ class ImitationTrainer:
             "demonstrations": float(self.demonstrations.added),
             "corrections": float(self.corrections.added),
         }
+
+
+def start_from(network: LearnedPlanner, path: Path) -> None:
+    """Copy the weights of a trained planner where names and shapes agree; the rest keeps its initialisation.
+
+    Raises:
+        WeightsError: If the file is damaged.
+    """
+    trained = load(path).state_dict()
+    fitting = {k: v for k, v in network.state_dict().items() if k in trained and trained[k].shape == v.shape}
+    network.load_state_dict({k: trained[k] for k in fitting}, strict=False)
 
 
 def _convolutions_channels_last(network: nn.Module) -> None:

@@ -45,6 +45,8 @@ class PlannerOutput(NamedTuple):
     (STAY: none)."""
     push: Tensor
     """Log-probability that the next push is that of the box in each cell in each direction, [B, 4, I, I]."""
+    push_dead: Tensor | None
+    """Logit of "no solution is left after this push", [B, 4, I, I]; None for a network that does not judge pushes."""
 
 
 class LearnedPlanner(nn.Module, Planner):
@@ -142,11 +144,14 @@ def input_planes(abstract_state: Tensor) -> Tensor:
 class PlannerHeads(nn.Module):
     """Policy, Q, dead-state, plan-map and push heads, reading the features at the robot's cell and over the board."""
 
-    def __init__(self, channels: int, *, propagation: bool, hidden: int = 128, squeeze: int = 32) -> None:
+    def __init__(
+        self, channels: int, *, propagation: bool, judge: bool, hidden: int = 128, squeeze: int = 32
+    ) -> None:
         """Build heads over `channels` features; the board is squeezed to `squeeze` channels per cell.
 
         With `propagation` the push head chooses among the legal pushes, and the policy reads from it, through a value
-        iteration over the board, which way leads there.
+        iteration over the board, which way leads there. With `judge` as well, each push is judged where the box is,
+        and what is judged deadly is not wanted.
         """
         super().__init__()
         self.squeeze = nn.Conv2d(channels, squeeze, 1)
@@ -157,6 +162,9 @@ class PlannerHeads(nn.Module):
         self.plan = nn.Conv2d(channels, INSTRUCTIONS, 1)
         self.push = nn.Conv2d(channels, INSTRUCTIONS - 1, 1)
         self.walk = nn.Parameter(torch.tensor([4.0, 8.0])) if propagation else None
+        self.push_dead = nn.Sequential(
+            nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, INSTRUCTIONS - 1, 1)
+        ) if judge and propagation else None
 
     def forward(self, features: Tensor, planes: Tensor, reachable: Tensor | None) -> PlannerOutput:
         """Return the outputs.
@@ -174,13 +182,17 @@ class PlannerHeads(nn.Module):
         if reachable is not None:
             push = push + (legal_pushes(planes, reachable) + 1e-4).log()
         push = push - push.logsumexp((1, 2, 3), keepdim=True)
+        dead, push_dead = self.dead(hidden).float(), None
+        wanted = push.detach()
+        if self.push_dead is not None:
+            push_dead = self.push_dead(features).float()
+            wanted = wanted + functional.logsigmoid(-push_dead.detach())
+            wanted = wanted - wanted.amax((1, 2, 3), keepdim=True)
         if self.walk is not None:
-            towards, start = walk_to_push(push.detach().exp(), planes)
+            towards, start = walk_to_push(wanted.exp(), planes)
             guide = self.walk[0] * towards + self.walk[1] * start
             policy = policy + functional.pad(guide, (1, 0))
-        return PlannerOutput(
-            policy, self.q(hidden).float(), self.dead(hidden).float(), self.plan(features).float(), push
-        )
+        return PlannerOutput(policy, self.q(hidden).float(), dead, self.plan(features).float(), push, push_dead)
 
 
 class PoolAndInject(nn.Module):
@@ -216,13 +228,13 @@ class ResidualBlock(nn.Module):
 class ResidualPlanner(LearnedPlanner):
     """Residual network over the board. Its thinking time averages over symmetric views of the board."""
 
-    def __init__(self, channels: int = 64, blocks: int = 8, propagation: bool = True) -> None:
+    def __init__(self, channels: int = 64, blocks: int = 8, propagation: bool = True, judge: bool = False) -> None:
         """Build `blocks` residual blocks of `channels` channels."""
         super().__init__(propagation=propagation)
-        self._config = {"channels": channels, "blocks": blocks, "propagation": propagation}
+        self._config = {"channels": channels, "blocks": blocks, "propagation": propagation, "judge": judge}
         self.encoder = nn.Conv2d(self.inputs, channels, 3, padding=1)
         self.blocks = nn.Sequential(*(ResidualBlock(channels) for _ in range(blocks)))
-        self.readout = PlannerHeads(channels, propagation=propagation)
+        self.readout = PlannerHeads(channels, propagation=propagation, judge=judge)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -302,7 +314,7 @@ class RecurrentPlanner(LearnedPlanner):
         )
         self.cells = nn.ModuleList([ConvLSTMCell(channels) for _ in range(depth)])
         self.initial = nn.Parameter(torch.zeros(depth, 2, channels, INTERIOR, INTERIOR))
-        self.readout = PlannerHeads(channels, propagation=propagation)
+        self.readout = PlannerHeads(channels, propagation=propagation, judge=False)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.symmetry import SYMMETRIES, cell_sources, instruction_map
-from mujoban_sim.bitboard import SIDE, SQUARES
-from mujoban_sim.grid import Instruction
+from mujoban_sim.bitboard import SIDE, SQUARE_STEP, SQUARES
+from mujoban_sim.grid import AGENT, Instruction
 
 EVERY_INSTRUCTION = (1 << len(Instruction)) - 1
 """The mask of all instructions."""
@@ -72,6 +72,14 @@ class Batch(NamedTuple):
     """bool [B, A]."""
     next_push: Tensor
     """Flat index into [4, I, I], int64 [B]."""
+
+    def adjacent_pushes(self) -> Tensor:
+        """Return the flat index into [4, I, I] of the push that each move would be, int64 [B, 4]."""
+        interior = self.state[:, 1:-1, 1:-1, AGENT].flatten(1).argmax(1, keepdim=True)
+        moves = torch.arange(len(Instruction) - 1, device=interior.device)
+        ahead = interior + torch.from_numpy(SQUARE_STEP).to(interior.device)
+        # Beyond the edge there is no box: which square stands for it does not matter.
+        return moves * SQUARES + ahead.clamp(0, SQUARES - 1)
 
     def to(self, device: torch.device | str) -> Batch:
         """Return the batch on a device."""

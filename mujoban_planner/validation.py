@@ -32,11 +32,14 @@ class NetworkConfig:
     propagation: bool = True
     """Spread over the board by the rules where the robot can walk and boxes be pushed; the paper's network does not."""
 
+    judge: bool = False
+    """Judge each push where the box is (residual, with propagation); its gain is not measured yet."""
+
     def build(self) -> LearnedPlanner:
         """Return a new network."""
         if self.architecture == "recurrent":
             return RecurrentPlanner(self.channels, self.depth, self.repeats, self.propagation)
-        return ResidualPlanner(self.channels, self.blocks, self.propagation)
+        return ResidualPlanner(self.channels, self.blocks, self.propagation, self.judge)
 
 
 def validation_levels(difficulty: int, n: int) -> LevelBatch:
