@@ -21,6 +21,8 @@ def main() -> int:
     unknown = sorted(set(names) - set(DEFAULT))
     if unknown:
         parser.error(f"unknown benchmark {unknown[0]!r}: expected some of {', '.join(DEFAULT)}")
+    # The comparison with MuJoCo's own renderer needs a backend that works without a display.
+    os.environ.setdefault("MUJOCO_GL", "egl")
     report = {
         "machine": {"cores": os.cpu_count(), "load": os.getloadavg()[0], "python": platform.python_version()},
         **{name: importlib.import_module(f"benchmarks.{name}").run() for name in names},
