@@ -1,4 +1,4 @@
-"""Draw learning curves of runs: `python -m mujoban_planner.curves RUN... --out docs/planner_curves.png`."""
+"""Draw learning curves of runs: `python -m mujoban_planner.curves RUN... --out docs/images/planner_curve.png`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Options:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Run directories."""
-    out: Path = Path("docs/planner_curves.png")
+    out: Path = Path("docs/images/planner_curve.png")
     """Image to write."""
     difficulty: int = 5
     """Difficulty whose solve rate is drawn."""

@@ -43,7 +43,7 @@ def test_decisions_do_not_depend_on_the_batch(planner):
     assert together.tolist() == alone
 
 
-@pytest.mark.parametrize("planner", [ResidualPlanner(16, 2), ResidualPlanner(8, 1, judge=True), RecurrentPlanner(8, 2, 2)])
+@pytest.mark.parametrize("planner", [ResidualPlanner(16, 2), ResidualPlanner(8, 1, judge=True), RecurrentPlanner(8)])
 def test_heads_have_the_shapes_of_the_paper_and_gradients_reach_every_weight(planner):
     output = planner(torch.from_numpy(_states(3)))
     assert output.policy.shape == output.q.shape == output.dead.shape == (3, len(Instruction))
