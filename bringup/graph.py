@@ -40,6 +40,8 @@ NODES: dict[str, type[GraphNode]] = {
 
 RESPAWN_PERIOD = 0.1
 """Seconds between two looks at whether the processes live."""
+RESTART_LIMIT = 20
+"""Times that a node is started again before the graph is given up."""
 STOP_TIMEOUT = 5.0
 """Seconds that a process has to end when it is asked to."""
 
@@ -145,7 +147,7 @@ class Processes:
         """Start again what has ended.
 
         Raises:
-            GraphError: If a node ended because its input is bad.
+            GraphError: If a node ended because its input is bad, or has ended too often.
         """
         for name, child in self._children.items():
             status = child.poll()
@@ -153,6 +155,8 @@ class Processes:
                 continue
             if status == USAGE_ERROR:
                 raise GraphError(f"the {name} node could not start")
+            if self.restarts[name] == RESTART_LIMIT:
+                raise GraphError(f"the {name} node has ended {RESTART_LIMIT + 1} times, with status {status} at last")
             self.restarts[name] += 1
             self._children[name] = self._start(name)
 

@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 
 from bringup.command import Stack
 from bringup.domain import claim_domain
-from bringup.graph import NODES, RESPAWN_PERIOD, InProcess, Processes
+from bringup.graph import NODES, RESPAWN_PERIOD, GraphError, InProcess, Processes
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from bringup.recorder import RecorderNode
@@ -110,13 +110,22 @@ def play(
             exits.enter_context(viewer())
         if options.processes:
             processes = exits.enter_context(Processes(parameters))
-            monitor.create_timer(RESPAWN_PERIOD, processes.supervise)
+            monitor.create_timer(RESPAWN_PERIOD, lambda: _supervise(processes, monitor))
         if on_refresh is not None:
             monitor.create_timer(refresh_period, lambda: on_refresh(monitor, monitor.results))
         spin(graph.executor, monitor.finished, received)
+        monitor.finished.result()
         _drain(graph.executor, listeners, monitor.stamp)
         counts = processes.restarts if options.processes else graph.counts()
         return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts)
+
+
+def _supervise(processes: Processes, monitor: MonitorNode) -> None:
+    """Start again what has ended; a graph that cannot go on ends the run, and `spin` with it."""
+    try:
+        processes.supervise()
+    except GraphError as error:
+        monitor.finished.set_exception(error)
 
 
 def _drain(executor: Executor, listeners: Sequence[RecorderNode | VideoNode], stamp: int) -> None:

@@ -27,6 +27,7 @@ from mujoban_msgs_py.tick_node import LOG_PERIOD, live_qos, run_node
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.episodes import Episodes
 from mujoban_sim.grid import CONTROL_PERIOD, DIFFICULTIES
+from mujoban_sim.rendering import RenderingError
 from mujoban_sim.world import World
 
 MATCH_PERIOD = 0.02
@@ -92,6 +93,7 @@ class SimulatorNode(Node):
         Raises:
             ValueError: If a parameter is out of its range or the level file is malformed.
             OSError: If the level file cannot be read.
+            RenderingError: If there is no OpenGL.
         """
         super().__init__("simulator", **options)
         self.counts: Counter[str] = Counter()
@@ -113,6 +115,9 @@ class SimulatorNode(Node):
             raise ValueError(f"realtime is {self._speed}: expected a speed above 0, or 0 for lockstep")
         self._observation = ObservationPublisher(self, self.world, self._settings["top_camera_size"])
         self._progress = self._read_progress()
+        # What is missing to draw with shows now, and the first tick is as quick as the others.
+        self.world.reset([0], [self.episodes[self._progress.index]])
+        self.world.render()
         self._stamp = self._first_stamp = self._progress.stamp
         self._torque: NDArray[np.float32] | None = None
         self._held_torque = np.zeros(self.world.body.action_size, np.float32)
@@ -334,8 +339,12 @@ class SimulatorNode(Node):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(SimulatorNode, args)
+    """Run the node; without OpenGL it ends with one line on stderr and status 2, as for other bad input."""
+    try:
+        return run_node(SimulatorNode, args)
+    except RenderingError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":
