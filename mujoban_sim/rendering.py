@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, Literal, TypeVar
@@ -164,10 +165,12 @@ class _Painter:
             mujoco.mjr_render(self._viewport, self._drawn, self._context)
             mujoco.mjr_readPixels(out[i], None, self._viewport, self._context)
 
-    def close(self) -> None:
-        """Free the context and end the thread."""
-        self.submit(self._close).result()
-        self._thread.shutdown()
+    def close(self, *, wait: bool = True) -> None:
+        """Free the context, in the thread to which it belongs, and end the thread."""
+        freed = self.submit(self._close)
+        if wait:
+            freed.result()
+        self._thread.shutdown(wait=wait)
 
     def _close(self) -> None:
         self._context.free()
@@ -204,6 +207,10 @@ class FrameRenderer:
             _Painter(body, max_boxes, len(range(first, batch, threads)), size) for first in range(threads)
         ]
         self._qpos_size = self._painters[0].qpos_size
+        # A context that the garbage collector frees, in whatever thread it happens to run, deletes buffers of the
+        # context that is current there. So a renderer which was dropped is closed as one that was closed.
+        self._finalizer = weakref.finalize(self, _abandon, self._painters)
+        self._finalizer.atexit = False
         self._targets = np.zeros((batch, max_boxes, 2))
         self._has_target = np.zeros((batch, max_boxes), np.bool_)
         self._ready = np.zeros(batch, np.bool_)
@@ -333,6 +340,13 @@ class FrameRenderer:
 
     def close(self) -> None:
         """Free the contexts; the renderer cannot be used afterwards."""
-        for painter in self._painters:
-            painter.close()
+        if self._finalizer.detach() is not None:
+            for painter in self._painters:
+                painter.close()
         self._painters = []
+
+
+def _abandon(painters: Sequence[_Painter]) -> None:
+    """Close painters without waiting for them: this may run in the thread of one."""
+    for painter in painters:
+        painter.close(wait=False)

@@ -1,4 +1,5 @@
 import dataclasses
+import gc
 import importlib
 
 import numpy as np
@@ -262,3 +263,17 @@ def test_without_opengl_the_error_names_the_packages_to_install(monkeypatch):
     monkeypatch.setattr(importlib, "import_module", fail)
     with pytest.raises(RenderingError, match="libegl1 and libgl1-mesa-dri"):
         FrameRenderer(1, BALL, 1)
+
+
+def test_a_renderer_that_the_garbage_collector_frees_does_no_harm_to_another():
+    kept = FrameRenderer(1, BALL, BOXES)
+    dropped = FrameRenderer(1, BALL, BOXES)
+    cycle = [dropped]
+    cycle.append(cycle)
+    del dropped, cycle
+    # The collector may run in the thread of any context.
+    kept._painters[0].submit(gc.collect).result()
+    kept.set_episode(0, CRAMPED, 0)
+    frame = kept.render(np.zeros((1, kept._qpos_size)), np.zeros((1, BOXES), bool), np.zeros((1, BOXES), bool))
+    assert frame.std() > 0
+    kept.close()
