@@ -10,7 +10,7 @@ from benchmarks.paper.runs import CONFIGURATIONS, DIFFICULTY, RESULTS, SEED
 INTRODUCTION = f"""# Results
 
 Rebuilt by `make results` from the JSON in `json/`, which `python -m benchmarks.paper.runs` writes by running
-`bringup/evaluate.py` on 512 levels of the generator with seeds {SEED} to {SEED + 511}, never used in training.
+`bringup/evaluate.py` on n levels of the generator with seeds from {SEED} on, never used in training (paper: n = 512).
 Intervals are 95 % Wilson intervals of the success rate. A row marked † was measured with other weights than those
 that ship now.
 """
