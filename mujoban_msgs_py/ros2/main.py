@@ -29,6 +29,7 @@ def main(args: Sequence[str] | None = None) -> int:
     other = other_command(os.environ.get("PATH", ""), Path(sys.argv[0]))
     if other is not None:
         os.execve(other, [str(other), *arguments], environment_outside(dict(os.environ), Path(sys.prefix)))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     return run(arguments)
 
 
@@ -62,7 +63,6 @@ def run(arguments: Sequence[str]) -> int:
 
     confine_discovery()
     options = make_parser(next(iter(arguments), None)).parse_args(arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         status = options.run(options)
         sys.stdout.flush()

@@ -43,13 +43,18 @@ class Session:
         self._sim_time = sim_time
 
     def __enter__(self) -> Self:
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        self._context = rclpy.Context()
+        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         overrides = [Parameter("use_sim_time", value=True)] if self._sim_time else []
         name = f"_ros2cli_{os.getpid()}"
         self.node = rclpy.create_node(
-            name, enable_rosout=False, start_parameter_services=False, parameter_overrides=overrides
+            name,
+            context=self._context,
+            enable_rosout=False,
+            start_parameter_services=False,
+            parameter_overrides=overrides,
         )
-        self.executor: Executor = EventsExecutor()
+        self.executor: Executor = EventsExecutor(context=self._context)
         self.executor.add_node(self.node)
         return self
 
@@ -57,7 +62,7 @@ class Session:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.node.destroy_node()
-        rclpy.shutdown()
+        self._context.try_shutdown()
 
     def until(self, done: Callable[[], bool], timeout: float | None = DISCOVERY_LIMIT) -> bool:
         """Spin until `done` or for `timeout` seconds (None: for ever); returns whether it is done."""

@@ -4,9 +4,10 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from contextlib import suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from std_srvs.srv import SetBool
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter, open_bag
-from mujoban_msgs_py.ros2.main import environment_outside, other_command
+from mujoban_msgs_py.ros2.main import environment_outside, other_command, run
 from mujoban_msgs_py.ros2.messages import fill, to_csv, to_yaml
 from mujoban_msgs_py.ros2.session import CommandError
 
@@ -30,9 +31,17 @@ def start(*arguments):
 
 
 def ros2(*arguments, status=0):
-    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == status, done.stderr
-    return done.stdout if status == 0 else done.stderr
+    """Run the command in this process, which spares the time to start one; returns stdout, or stderr if it fails."""
+    # Real files, since the executor hands stderr's descriptor to the fault handler.
+    with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
+        with redirect_stdout(out), redirect_stderr(err):
+            try:
+                result = run(arguments)
+            except SystemExit as leaving:
+                result = leaving.code
+        texts = [(file.seek(0), file.read())[1] for file in (out, err)]
+    assert result == status, texts[1]
+    return texts[1] if status else texts[0]
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +113,7 @@ def test_hz_measures_the_rate(talker):
     process = start("topic", "hz", "/pose")
     lines = [process.stdout.readline() for _ in range(2)]
     process.send_signal(signal.SIGINT)
-    assert process.wait(10) == 130
+    assert process.wait(30) == 130
     rate = float(re.fullmatch(r"average rate: (\d+\.\d{3})\n", lines[0])[1])
     assert 10 < rate < 60
     assert re.fullmatch(r"\tmin: \d\.\d{3}s max: \d\.\d{3}s std dev: \d\.\d{5}s window: \d+\n", lines[1])
@@ -158,12 +167,12 @@ def test_bad_input_is_one_line_and_status_2(arguments, expected):
 
 def test_records_until_interrupted(talker, tmp_path):
     process = start("bag", "record", "-o", str(tmp_path / "bag"), "/pose", "/episode")
-    end = time.monotonic() + 30
+    end = time.monotonic() + 90
     while talker.count < 1 or "Subscribed to topic '/pose'" not in process.stderr.readline():
         assert time.monotonic() < end
     time.sleep(1.0)
     process.send_signal(signal.SIGINT)
-    assert process.wait(20) == 0
+    assert process.wait(60) == 0
     bag = open_bag(tmp_path / "bag")
     stamps = [t.stamp for t in bag.ticks([topics.POSE])]
     assert len(stamps) > 20 and set(np.diff(stamps)) == {topics.TICK}
@@ -195,7 +204,9 @@ def test_plays_every_message_to_a_node_that_listens(ros, bag):
     heard, clock = [], []
     node.create_subscription(topics.POSE.type, "/replayed", heard.append, topics.POSE.qos)
     node.create_subscription(topics.CLOCK.type, topics.CLOCK.name, clock.append, topics.CLOCK.qos)
-    process = start("bag", "play", str(bag), "-r", "4", "--clock", "--topics", "/pose", "-m", "/pose:=/replayed")
+    process = start(
+        "bag", "play", str(bag), "-r", "4", "-d", "3", "--clock", "--topics", "/pose", "-m", "/pose:=/replayed"
+    )
     while process.poll() is None:
         ros.spin_once(node, timeout_sec=0.05)
     assert process.returncode == 0, process.stderr.read()
@@ -209,9 +220,9 @@ def test_a_damaged_bag_is_described_with_a_warning_and_reindexed(bag):
     file = bag / "bag_0.mcap"
     file.write_bytes(file.read_bytes()[:-30])
     assert "is truncated" in ros2("bag", "play", str(bag), status=2)
-    done = subprocess.run([*COMMAND, "bag", "info", bag], capture_output=True, text=True, check=True)
-    assert "warning: bag_0.mcap is truncated" in done.stderr and "Messages:          40" in done.stdout
-    ros2("bag", "reindex", str(bag))
+    assert "Messages:          40" in ros2("bag", "info", str(bag))
+    done = subprocess.run([*COMMAND, "bag", "reindex", bag], capture_output=True, text=True, check=True)
+    assert "warning: bag_0.mcap is truncated" in done.stderr
     assert len(list(open_bag(bag).messages())) == 40
 
 
