@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,10 @@ from torch.nn import functional
 
 from mujoban_planner import load
 from mujoban_planner.lessons import LessonMaker, LessonProcess
-from mujoban_planner.planner import LearnedPlanner, input_planes
-from mujoban_planner.propagation import shifted
+from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch, SampleBuffer, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
-from mujoban_planner.validation import NetworkConfig, solve_rates
+from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares, solve_rates
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
 from mujoban_rl.weights import provenance, save_weights
 from mujoban_sim.grid import AGENT, BOX, TARGET, WALL
@@ -57,15 +56,17 @@ class ImitationConfig(NetworkConfig):
     """Decay of the averaged weights, which are what is played and shipped."""
     corrections: float = 0.5
     """Share of a batch that corrects the planner's own play (DAgger), once there is some."""
-    trials: int = 12
-    """Wrong pushes tried out per demonstration."""
+    judged: float = 1.0
+    """Share of the arrangements of boxes in demonstrations in which every possible push is judged."""
+    freshness: float = 0.4
+    """New samples, of demonstrations and of corrections each, per sample that is learned from."""
     init: str | None = None
     """Weights to start from, where names and shapes agree."""
     noise: float = 0.1
     """Share of a batch whose abstract states are made uncertain, as estimates are."""
-    mix: dict[int, float] = field(default_factory=lambda: {1: 0.03, 2: 0.04, 3: 0.06, 4: 0.12, 5: 0.75})
-    """Share of each difficulty among the training levels."""
-    buffer: int = 3_000_000
+    mix: Shares = (0.03, 0.04, 0.06, 0.12, 0.75)
+    """Shares of difficulties 1 to 5 among the training levels."""
+    buffer: int = 2_000_000
     """Samples kept of demonstrations, and as many of corrections."""
     seed: int = 0
 
@@ -89,7 +90,10 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: ImitationConfig) ->
     dead = functional.binary_cross_entropy_with_logits(output.dead, batch.dead.float(), weight=known, reduction="sum")
     dead = dead / known.sum().clamp(min=1)
     if output.push_dead is not None:
-        dead = dead + _push_verdicts(output.push_dead.flatten(1), batch, shown)
+        verdicts = functional.binary_cross_entropy_with_logits(
+            output.push_dead, batch.push_dead.float(), weight=batch.push_known.float(), reduction="sum"
+        )
+        dead = dead + verdicts / batch.push_known.sum().clamp(min=1)
     q_known = (batch.right | batch.dead).float()
     q_target = torch.where(batch.dead, -1.0, batch.value[:, None])
     q = functional.smooth_l1_loss(output.q, q_target, reduction="none")
@@ -105,25 +109,6 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: ImitationConfig) ->
     parts = {"policy": policy, "accuracy": accuracy, "push": push, "push_accuracy": best.sum() / n}
     parts |= {"plan": plan, "dead": dead, "dead_recall": caught, "q": q}
     return loss, {k: v.detach() for k, v in parts.items()}
-
-
-def _push_verdicts(push_dead: Tensor, batch: Batch, shown: Tensor) -> Tensor:
-    """Return the cross-entropy of the verdicts on pushes, [B, 4 * I * I], deadly ones and others alike in weight.
-
-    Known are the pushes next to the robot that were tried or shown, and the next push of a demonstration.
-    """
-    index = batch.adjacent_pushes()
-    floor, _, agent, box = input_planes(batch.state).unbind(1)
-    beside = (shifted(box) * agent[:, None]).sum((2, 3)) > 0.5  # Shape [B, 4]
-    pushable = torch.minimum(shifted(torch.minimum(floor, 1.0 - box)), box[:, None]).flatten(1) > 0.5
-    known = batch.dead_known[:, 1:] & ~batch.dead[:, :1] & beside & pushable.gather(1, index)
-    logits = torch.cat([push_dead.gather(1, index), push_dead.gather(1, batch.next_push[:, None])], 1)
-    known = torch.cat([known, shown[:, None]], 1)
-    dead = torch.cat([batch.dead[:, 1:], torch.zeros_like(shown[:, None])], 1)
-    loss = functional.binary_cross_entropy_with_logits(logits, dead.float(), reduction="none")
-    deadly, harmless = (known & dead).float(), (known & ~dead).float()
-    halves = [(loss * w).sum() / w.sum().clamp(min=1.0) for w in (deadly, harmless)]
-    return halves[0] + halves[1]
 
 
 def make_uncertain(state: Tensor, share: float, generator: torch.Generator) -> Tensor:
@@ -193,10 +178,11 @@ class ImitationTrainer:
         self._maker: LessonMaker | None = None
         self._process: LessonProcess | None = None
         stream = 1000 * config.seed + self.bits
+        mix = difficulty_shares(config.mix)
         if processes:
-            self._process = LessonProcess(stream, config.mix, config.trials, self.played_weights, niceness=5)
+            self._process = LessonProcess(stream, mix, config.judged, self.played_weights, niceness=5)
         else:
-            self._maker = LessonMaker(stream, config.mix, config.trials)
+            self._maker = LessonMaker(stream, mix, config.judged)
 
     def run(self, *, seconds: float | None, samples: float, evaluate_every: float, save_every: float) -> None:
         """Train until the schedule ends, for `seconds`, up to `samples`, or until a signal; then save."""
@@ -282,10 +268,11 @@ class ImitationTrainer:
 
     def _collect(self) -> None:
         """Fetch lessons where the buffers lag behind what was consumed."""
+        config = self.config
         first = self.demonstrations.size == 0
-        stock = _STOCK_BATCHES * self.config.batch_size
-        fresh_wanted = self.demonstrations.added < stock + 0.5 * self.samples
-        played_wanted = self.samples > stock and self.corrections.added < 0.5 * self.samples
+        stock = _STOCK_BATCHES * config.batch_size
+        fresh_wanted = self.demonstrations.added < stock + config.freshness * self.samples
+        played_wanted = self.samples > stock and self.corrections.added < config.freshness * self.samples
         if self._maker is not None:
             if fresh_wanted:
                 self.demonstrations.add(self._maker.demonstrations())

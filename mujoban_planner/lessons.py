@@ -38,13 +38,13 @@ _SEEDS_PER_STREAM: Final = 10**12
 class LessonMaker:
     """Makes samples from fresh training levels; deterministic given its stream."""
 
-    def __init__(self, stream: int, mix: dict[int, float], trials: int = 2) -> None:
+    def __init__(self, stream: int, mix: dict[int, float], judged: float = 1.0) -> None:
         """Use the training seeds and randomness of `stream` (0, 1, ...).
 
         Args:
             stream: Number of this maker; different streams share no level.
             mix: Share of each difficulty among the levels.
-            trials: Wrong pushes tried out per demonstration.
+            judged: Share of the arrangements of boxes on the way in which every possible push is judged.
 
         Raises:
             ValueError: If the stream has no seeds left in `TRAIN_SEEDS`.
@@ -55,7 +55,7 @@ class LessonMaker:
         self._rng = np.random.default_rng([stream, 1])
         self._mix = {d: share / sum(mix.values()) for d, share in mix.items() if share > 0}
         self._teacher = Teacher()
-        self._trials = trials
+        self._judged = judged
 
     def levels(self, n: int) -> list[LevelBatch]:
         """Return about `n` fresh levels, one part per difficulty."""
@@ -70,7 +70,7 @@ class LessonMaker:
 
     def demonstrations(self, n: int = 256) -> Samples:
         """Return samples of the solutions of `n` fresh levels, thinned on walks."""
-        parts = [self._teacher.demonstrate(levels, self._rng, trials=self._trials) for levels in self.levels(n)]
+        parts = [self._teacher.demonstrate(levels, self._rng, judged=self._judged) for levels in self.levels(n)]
         samples = concatenate(parts)
         walking = (samples.right != 0) & (samples.right & possible_pushes(samples.boards) == 0)
         return samples.take(~walking | (self._rng.random(len(walking)) < _WALK_SHARE))
@@ -99,14 +99,14 @@ class LessonMaker:
         rows = batch[lost]
         if rows.size:
             before = _states(levels, game, rows, first_dead[rows] - 1)
-            parts.append(self._teacher.demonstrate(before, self._rng, trials=4, keep=12))
+            parts.append(self._teacher.demonstrate(before, self._rng, keep=12))
             parts.append(label_deadly(before, game.instructions[rows, first_dead[rows] - 1]))
             later = self._rng.integers(first_dead[rows], length[rows] + 1)
             parts.append(self._teacher.demonstrate(_states(levels, game, rows, later), self._rng))
         # Anywhere on its way: what it sees that demonstrations do not visit.
         alive_until = np.where(lost, np.maximum(first_dead - 1, 1), length)
         somewhere = _states(levels, game, batch, self._rng.integers(0, alive_until))
-        parts.append(self._teacher.demonstrate(somewhere, self._rng, trials=2, keep=8))
+        parts.append(self._teacher.demonstrate(somewhere, self._rng, judged=self._judged, keep=6))
         return parts
 
     def _first_dead(self, levels: LevelBatch, game: Game) -> NDArray[np.int64]:
@@ -134,13 +134,13 @@ def _states(levels: LevelBatch, game: Game, rows: NDArray[np.int64], times: NDAr
 class LessonProcess:
     """A `LessonMaker` in a process of its own, which plays with the newest weights that the trainer has written."""
 
-    def __init__(self, stream: int, mix: dict[int, float], trials: int, weights: Path, niceness: int) -> None:
+    def __init__(self, stream: int, mix: dict[int, float], judged: float, weights: Path, niceness: int) -> None:
         """Start the process; corrections come once `weights` exists."""
         context = get_context("spawn")
         self._stop: Event = context.Event()
         self.demonstrations: Queue[Samples] = context.Queue(maxsize=2)
         self.corrections: Queue[Samples] = context.Queue(maxsize=2)
-        arguments = (stream, mix, trials, weights, niceness, self._stop, self.demonstrations, self.corrections)
+        arguments = (stream, mix, judged, weights, niceness, self._stop, self.demonstrations, self.corrections)
         self._process = context.Process(target=_make_lessons, args=arguments, daemon=True)
         self._process.start()
 
@@ -171,7 +171,7 @@ class LessonProcess:
 def _make_lessons(
     stream: int,
     mix: dict[int, float],
-    trials: int,
+    judged: float,
     weights: Path,
     niceness: int,
     stop: Event,
@@ -180,7 +180,7 @@ def _make_lessons(
 ) -> None:
     torch.set_num_threads(1)
     os.nice(niceness)
-    maker = LessonMaker(stream, mix, trials)
+    maker = LessonMaker(stream, mix, judged)
     planner: LearnedPlanner | None = None
     version = 0.0
     while not stop.is_set() and os.getppid() != 1:

@@ -26,7 +26,7 @@ from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.teacher import DISCOUNT
-from mujoban_planner.validation import NetworkConfig, solve_rates
+from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares, solve_rates
 from mujoban_rl.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
 from mujoban_rl.replay import TimeMajorReplay, windowed_returns
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
@@ -63,7 +63,7 @@ class MPOConfig(NetworkConfig):
     """Probability that an instruction fails, as with a real controller."""
     bag_share: float = 0.25
     """Share of a batch that comes from bags, where there are any."""
-    mix: dict[int, float] = field(default_factory=lambda: {1: 0.1, 2: 0.1, 3: 0.15, 4: 0.2, 5: 0.45})
+    mix: Shares = (0.1, 0.1, 0.15, 0.2, 0.45)
     """Share of each difficulty among the training levels."""
     seed: int = 0
 
@@ -130,7 +130,7 @@ class MPOTrainer:
             ]
         )
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.levels = LevelStream(config.mix, config.seed)
+        self.levels = LevelStream(difficulty_shares(config.mix), config.seed)
         self.updates, self.env_steps, self.seconds = 0, 0, 0.0
         self._restore()
         failures = torch.Generator(self.device).manual_seed(config.seed)

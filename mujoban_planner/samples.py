@@ -17,11 +17,12 @@ from torch import Tensor
 
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.symmetry import SYMMETRIES, cell_sources, instruction_map
-from mujoban_sim.bitboard import SIDE, SQUARE_STEP, SQUARES
-from mujoban_sim.grid import AGENT, Instruction
+from mujoban_sim.bitboard import SIDE, SQUARES
+from mujoban_sim.grid import Instruction
 
 EVERY_INSTRUCTION = (1 << len(Instruction)) - 1
 """The mask of all instructions."""
+_MOVES = len(Instruction) - 1
 
 
 class Samples(NamedTuple):
@@ -44,6 +45,10 @@ class Samples(NamedTuple):
     """Mask of the instructions after which no solution is left, [S]."""
     next_push: NDArray[np.uint8]
     """Next push, 4 * square of the box + direction, [S]; any value where `right` is 0."""
+    push_known: NDArray[np.uint64]
+    """Boxes whose push in each direction is known to leave a solution or none, as boards, [S, 4]."""
+    push_dead: NDArray[np.uint64]
+    """Boxes whose push in each direction leaves no solution, as boards, [S, 4]."""
 
     @property
     def boards(self) -> BitBoards:
@@ -72,14 +77,10 @@ class Batch(NamedTuple):
     """bool [B, A]."""
     next_push: Tensor
     """Flat index into [4, I, I], int64 [B]."""
-
-    def adjacent_pushes(self) -> Tensor:
-        """Return the flat index into [4, I, I] of the push that each move would be, int64 [B, 4]."""
-        interior = self.state[:, 1:-1, 1:-1, AGENT].flatten(1).argmax(1, keepdim=True)
-        moves = torch.arange(len(Instruction) - 1, device=interior.device)
-        ahead = interior + torch.from_numpy(SQUARE_STEP).to(interior.device)
-        # Beyond the edge there is no box: which square stands for it does not matter.
-        return moves * SQUARES + ahead.clamp(0, SQUARES - 1)
+    push_known: Tensor
+    """bool [B, 4, I, I]."""
+    push_dead: Tensor
+    """bool [B, 4, I, I]."""
 
     def to(self, device: torch.device | str) -> Batch:
         """Return the batch on a device."""
@@ -91,7 +92,8 @@ def unlabelled(boards: BitBoards) -> Samples:
     n = len(boards.agent)
     masks = [np.zeros(n, np.uint8) for _ in range(4)]
     plan, value = np.zeros((n, SQUARES), np.uint8), np.zeros(n, np.float32)
-    return Samples(*boards, masks[0], plan, value, *masks[1:])
+    known, dead = np.zeros((2, n, _MOVES), np.uint64)
+    return Samples(*boards, masks[0], plan, value, *masks[1:], push_known=known, push_dead=dead)
 
 
 def concatenate(parts: list[Samples]) -> Samples:
@@ -146,6 +148,8 @@ def make_batch(samples: Samples, symmetry: NDArray[np.int64]) -> Batch:
         dead_known,
         dead,
         torch.from_numpy(_next_pushes(samples.next_push, symmetry)),
+        _push_planes(samples.push_known, symmetry),
+        _push_planes(samples.push_dead, symmetry),
     )
 
 
@@ -160,6 +164,29 @@ def _next_pushes(next_push: NDArray[np.uint8], symmetry: NDArray[np.int64]) -> N
     square, direction = next_push.astype(np.int64) // 4, next_push.astype(np.int64) % 4
     direction = _INSTRUCTION_MAPS[symmetry, direction + 1] - 1
     return direction * SQUARES + _DESTINATIONS[symmetry, square]
+
+
+def _push_planes(pushes: NDArray[np.uint64], symmetry: NDArray[np.int64]) -> Tensor:
+    """Return sets of pushes, boards [S, 4], under symmetries as bool [S, 4, I, I]."""
+    planes = np.empty((len(pushes), _MOVES, SQUARES), np.bool_)
+    _fill_pushes(pushes, symmetry, _SOURCES, _INSTRUCTION_MAPS, planes)
+    return torch.from_numpy(planes).view(-1, _MOVES, SIDE, SIDE)
+
+
+@njit(cache=True, nogil=True)
+def _fill_pushes(
+    pushes: NDArray[np.uint64],
+    symmetry: NDArray[np.int64],
+    sources: NDArray[np.int64],
+    maps: NDArray[np.int64],
+    out: NDArray[np.bool_],
+) -> None:
+    for i in range(len(pushes)):
+        s = symmetry[i]
+        for d in range(pushes.shape[1]):
+            board, image = pushes[i, d], maps[s, d + 1] - 1
+            for c in range(SQUARES):
+                out[i, image, c] = (board >> np.uint64(sources[s, c])) & np.uint64(1)
 
 
 @njit(cache=True, nogil=True)

@@ -1,8 +1,8 @@
 """The teacher of imitation: the solver's demonstrations as labelled states.
 
-Every state on the way of a demonstration becomes a sample. Some wrong pushes on the way are tried out, and a solver
-proof that no solution is left makes a sample of a dead state. What cannot be decided within the node budget teaches
-nothing.
+Every state on the way of a demonstration becomes a sample. Every other push that is possible on the way is judged by
+the solver: its proof that no solution is left labels the push, and makes a sample of the dead state. What cannot be
+decided within the node budget teaches nothing.
 
 Shapes: B levels, S samples, N = `grid.GRID_SIZE`.
 """
@@ -12,11 +12,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from mujoban_planner.boards import BitBoards, bit_boards, take_levels
 from mujoban_planner.samples import EVERY_INSTRUCTION, Samples, concatenate, unlabelled
-from mujoban_sim.bitboard import SIDE, SQUARE_STEP
+from mujoban_sim.bitboard import SIDE, SQUARE_STEP, SQUARES, bit, flood, shift
 from mujoban_sim.grid import GRID_SIZE, OFFSETS_RC, Instruction
 from mujoban_sim.levels import LevelBatch
 from mujoban_sim.rules import BOX_REWARD, SOLVED_REWARD
@@ -30,6 +31,8 @@ HOPELESS: Final = STEP_REWARD / (1.0 - DISCOUNT)
 """Return where nothing but the cost of moving is left."""
 _QUICK_WEIGHT: Final = 2.0
 """Weight of the solver's heuristic where only solvability matters."""
+_DEAD_SHARE: Final = 0.05
+"""Share of the dead states behind judged pushes that become samples of their own; there are many."""
 
 
 class Teacher:
@@ -45,49 +48,57 @@ class Teacher:
         return solve_batch(levels, max_nodes=self.max_nodes, weight=_QUICK_WEIGHT).status
 
     def demonstrate(
-        self, levels: LevelBatch, rng: np.random.Generator, *, trials: int = 2, keep: int | None = None
+        self, levels: LevelBatch, rng: np.random.Generator, *, judged: float = 1.0, keep: int | None = None
     ) -> Samples:
         """Return the samples of a demonstration from each state.
 
         Args:
             levels: States; unsolvable ones become a dead sample each.
-            rng: Chooses among equal walks and the wrong pushes.
-            trials: Wrong pushes tried out per demonstration.
+            rng: Chooses among equal walks and what is judged.
+            judged: Share of the arrangements of boxes in which every push that is possible is judged.
             keep: States kept of each demonstration, from its start; all by default.
         """
         found = demonstrations(levels, rng=rng, max_nodes=self.max_nodes)
         dead = take_levels(levels, found.status == Status.UNSOLVABLE)
         parts = [_label_dead(bit_boards(dead))]
         if len(found.level):
-            samples = _label_demonstrations(levels, found)
-            wrong = self._try_wrong_pushes(levels, found, samples, rng, trials)
             first = np.searchsorted(found.level, found.level)  # Shape [S], where each state's demonstration begins
             kept = np.ones(len(first), np.bool_) if keep is None else np.arange(len(first)) - first < keep
-            parts += [samples.take(kept), wrong]
+            samples, upcoming = _label_demonstrations(levels, found)
+            pushes = np.unique(upcoming[kept])
+            pushes = pushes[rng.random(len(pushes)) < judged]
+            lost = self._judge_pushes(levels, found, samples, pushes)
+            # Until the next push the boxes stay where they are, and so do the verdicts.
+            samples.push_known[:], samples.push_dead[:] = samples.push_known[upcoming], samples.push_dead[upcoming]
+            shown = samples.take(kept)
+            parts += [_judge_instructions(shown), lost.take(rng.random(len(lost.agent)) < _DEAD_SHARE)]
         return concatenate(parts)
 
-    def _try_wrong_pushes(
-        self, levels: LevelBatch, found: Demonstrations, samples: Samples, rng: np.random.Generator, trials: int
+    def _judge_pushes(
+        self, levels: LevelBatch, found: Demonstrations, samples: Samples, rows: NDArray[np.int64]
     ) -> Samples:
-        """Judge some unknown pushes, note the outcome in `samples` in place, and return the dead states."""
-        unknown = EVERY_INSTRUCTION & ~samples.dead_known
-        candidates = np.flatnonzero(unknown)
-        n = min(trials * len(np.unique(found.level)), len(candidates))
-        rows = rng.choice(candidates, n, replace=False)
-        options = (unknown[rows, None] >> np.arange(len(Instruction))) & 1  # Shape [n, A]
-        instruction = (options * rng.random(options.shape)).argmax(1)
-        pushed = _push(_levels_of(levels, found, rows), instruction)
+        """Judge every push that is possible in states `rows`, note it in `samples` in place; return dead states."""
+        states = samples.take(rows)
+        options = reachable_pushes(states.boards) & ~states.push_known
+        bits = np.unpackbits(np.ascontiguousarray(options).view(np.uint8), axis=1, bitorder="little")
+        state, push = np.nonzero(bits)
+        direction, square = push // SQUARES, push % SQUARES
+        pushed = _push(_levels_of(levels, found, rows[state]), square, direction)
         status = solve_batch(pushed, max_nodes=self.trial_nodes, weight=_QUICK_WEIGHT).status
-        mask = (1 << instruction).astype(np.uint8)
+        board = np.uint64(1) << square.astype(np.uint64)
         decided, lost = status != Status.BUDGET, status == Status.UNSOLVABLE
-        samples.dead_known[rows[decided]] |= mask[decided]
-        samples.dead[rows[lost]] |= mask[lost]
+        np.bitwise_or.at(samples.push_known, (rows[state[decided]], direction[decided]), board[decided])
+        np.bitwise_or.at(samples.push_dead, (rows[state[lost]], direction[lost]), board[lost])
         return _label_dead(bit_boards(take_levels(pushed, lost)))
 
 
 def label_deadly(levels: LevelBatch, instruction: NDArray[np.int64]) -> Samples:
-    """Return samples that say only that an instruction, [B], leads from a solvable to a dead state."""
+    """Return samples that say only that an instruction, a push, [B], leads from a solvable to a dead state."""
     samples = unlabelled(bit_boards(levels))
+    direction = instruction - 1
+    board = np.uint64(1) << (samples.agent + SQUARE_STEP[direction]).astype(np.uint64)
+    for pushes in (samples.push_known, samples.push_dead):
+        pushes[np.arange(len(board)), direction] = board
     mask = (1 << instruction).astype(np.uint8)
     return samples._replace(dead_known=mask | np.uint8(1 << Instruction.STAY), dead=mask)
 
@@ -111,35 +122,71 @@ def _levels_of(levels: LevelBatch, found: Demonstrations, rows: NDArray[np.int64
     )
 
 
-def _push(levels: LevelBatch, instruction: NDArray[np.int64]) -> LevelBatch:
-    """Return states after pushes that are possible."""
-    step = OFFSETS_RC[instruction]
-    cell = levels.player + step
+def _push(levels: LevelBatch, square: NDArray[np.int64], direction: NDArray[np.int64]) -> LevelBatch:
+    """Return states after pushes that are possible, of the box on each square, [B], in each direction, [B]."""
+    cell = np.stack([square // SIDE + 1, square % SIDE + 1], -1)
     pushed = (levels.boxes == cell[:, None]).all(2)  # Shape [B, K]
+    step = OFFSETS_RC[direction + 1]
     boxes = np.where(pushed[:, :, None], levels.boxes + step[:, None], levels.boxes)
     return levels._replace(boxes=boxes, player=cell)
 
 
-def _label_demonstrations(levels: LevelBatch, found: Demonstrations) -> Samples:
+def _label_demonstrations(levels: LevelBatch, found: Demonstrations) -> tuple[Samples, NDArray[np.int64]]:
+    """Return the samples of demonstrations, and the row in which the next push of each is executed, [S]."""
     rows = np.arange(len(found.level))
     boards = bit_boards(_levels_of(levels, found, rows))
     samples = unlabelled(boards)
     right = np.packbits(found.optimal, axis=1, bitorder="little")[:, 0]
-    possible = possible_pushes(boards)
-    pushing = (right & possible) != 0
+    pushing = (right & possible_pushes(boards)) != 0
     direction = found.optimal[:, 1:].argmax(1)
     square = boards.agent.astype(np.int64) + SQUARE_STEP[direction]
     # A demonstration ends with a push, so that every state has a next one.
     upcoming = np.minimum.accumulate(np.where(pushing, rows, len(rows))[::-1])[::-1]
     next_push = (4 * square + direction)[upcoming].astype(np.uint8)
-    return samples._replace(
+    # What the demonstration does loses nothing.
+    samples.push_known[rows[pushing], direction[pushing]] = np.uint64(1) << square[pushing].astype(np.uint64)
+    labelled = samples._replace(
         right=right,
         plan=np.ascontiguousarray(found.plan[:, 1:-1, 1:-1]).reshape(len(rows), SIDE * SIDE),
         value=_returns(boards, found.steps_to_go),
-        # Walking, and what the demonstration does, loses nothing; other pushes are unknown.
-        dead_known=(EVERY_INSTRUCTION & ~possible) | right,
         next_push=next_push,
     )
+    return labelled, upcoming
+
+
+def _judge_instructions(samples: Samples) -> Samples:
+    """Return samples of demonstrations with the verdicts on instructions that follow from those on pushes."""
+    known = EVERY_INSTRUCTION & ~possible_pushes(samples.boards)  # Walking loses nothing
+    dead = np.zeros_like(samples.dead)
+    for direction, step in enumerate(SQUARE_STEP.tolist()):
+        # Beyond the edge there is no box, so whatever square stands there has no verdict.
+        ahead = np.clip(samples.agent.astype(np.int64) + step, 0, SQUARES - 1).astype(np.uint64)
+        beside = (possible_pushes(samples.boards) >> (direction + 1)) & 1
+        for mask, pushes in ((known, samples.push_known), (dead, samples.push_dead)):
+            mask |= ((pushes[:, direction] >> ahead).astype(np.uint8) & beside) << np.uint8(direction + 1)
+    return samples._replace(dead_known=known | samples.right, dead=dead)
+
+
+def reachable_pushes(boards: BitBoards) -> NDArray[np.uint64]:
+    """Return the boxes that can be pushed now in each direction, after any walk, as boards, [S, 4]."""
+    pushes = np.empty((len(boards.agent), len(Instruction) - 1), np.uint64)
+    _fill_reachable(*boards, pushes)
+    return pushes
+
+
+@njit(cache=True, nogil=True)
+def _fill_reachable(
+    wall: NDArray[np.uint64],
+    target: NDArray[np.uint64],
+    box: NDArray[np.uint64],
+    agent: NDArray[np.uint8],
+    out: NDArray[np.uint64],
+) -> None:
+    for i in range(len(agent)):
+        free = ~(wall[i] | box[i])
+        reached = flood(bit(agent[i]), free)
+        for direction in range(4):
+            out[i, direction] = box[i] & shift(reached, direction) & shift(free, (direction + 2) % 4)
 
 
 def possible_pushes(boards: BitBoards) -> NDArray[np.uint8]:

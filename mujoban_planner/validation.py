@@ -15,6 +15,15 @@ _EPISODES: Final = {5: 256, 4: 64, 1: 64}
 """Difficulty -> episodes of a periodic evaluation."""
 
 
+Shares = tuple[float, float, float, float, float]
+"""Shares of difficulties 1 to 5 among levels."""
+
+
+def difficulty_shares(shares: Shares) -> dict[int, float]:
+    """Return shares by difficulty."""
+    return dict(enumerate(shares, 1))
+
+
 @dataclass(frozen=True)
 class NetworkConfig:
     """What defines a planner network."""
@@ -32,8 +41,8 @@ class NetworkConfig:
     propagation: bool = True
     """Spread over the board by the rules where the robot can walk and boxes be pushed; the paper's network does not."""
 
-    judge: bool = False
-    """Judge each push where the box is (residual, with propagation); its gain is not measured yet."""
+    judge: bool = True
+    """Judge each push where the box is (residual, with propagation)."""
 
     def build(self) -> LearnedPlanner:
         """Return a new network."""

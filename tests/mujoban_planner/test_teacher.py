@@ -11,6 +11,7 @@ from mujoban_planner.symmetry import SYMMETRIES, transform_planes
 from mujoban_planner.teacher import DISCOUNT, Teacher, label_deadly
 from mujoban_sim import rules
 from mujoban_sim.generator import generate_batch
+from mujoban_sim.grid import OFFSETS_RC
 from mujoban_sim.levels import Level, stack_levels
 from mujoban_sim.solver import Status, solve_batch
 
@@ -22,7 +23,7 @@ def levels():
 
 @pytest.fixture(scope="module")
 def samples(levels):
-    return Teacher().demonstrate(levels, np.random.default_rng(0), trials=4)
+    return Teacher().demonstrate(levels, np.random.default_rng(0))
 
 
 def test_boards_round_trip_through_every_form(levels):
@@ -41,7 +42,7 @@ def test_following_right_instructions_solves_the_level_with_the_promised_return(
         ends = np.zeros(4, bool)
         instruction = np.zeros(4, np.int64)
         for i in np.flatnonzero(~over):
-            shown = teacher.demonstrate(take_levels(state, np.array([i])), rng, trials=0, keep=1)
+            shown = teacher.demonstrate(take_levels(state, np.array([i])), rng, judged=0.0, keep=1)
             instruction[i] = int(shown.right[0]).bit_length() - 1
             if promised is None or i not in promised:
                 promised = {**(promised or {}), i: shown.value[0]}
@@ -64,6 +65,8 @@ def test_labels_turn_with_the_board(samples):
     upright = make_batch(part, np.zeros(len(shown), np.int64))
     for symmetry in range(SYMMETRIES):
         batch = make_batch(part, np.full(len(shown), symmetry))
+        assert (batch.push_known.flatten(1).gather(1, batch.next_push[:, None])).all()
+        assert not (batch.push_dead & ~batch.push_known).any()
         assert torch.equal(batch.state, transform_planes(upright.state, symmetry))
         planes = input_planes(batch.state)
         legal = legal_pushes(planes, propagate(planes)[:, 0])
@@ -77,22 +80,45 @@ def test_labels_turn_with_the_board(samples):
         assert torch.equal(plan, batch.next_push // 64 + 1)
 
 
+def as_levels(samples):
+    states = state_tensor(samples.boards).numpy()
+    players = [tuple(np.argwhere(s[..., 2] > 0)[0].tolist()) for s in states]
+    return stack_levels(
+        [
+            Level(s[..., 0] > 0, s[..., 1] > 0, np.argwhere(s[..., 3] > 0), player)
+            for s, player in zip(states, players, strict=True)
+        ]
+    )
+
+
 def test_dead_labels_are_what_the_solver_proves(samples):
     dead = np.flatnonzero(samples.dead == 31)[:20]
     assert dead.size
     assert not samples.right[dead].any()
-    states = state_tensor(samples.take(dead).boards).numpy()
-    cells = [np.argwhere(s[..., 3] > 0) for s in states]
-    levels = stack_levels(
-        [
-            Level(s[..., 0] > 0, s[..., 1] > 0, c, tuple(int(x) for x in np.argwhere(s[..., 2] > 0)[0]))
-            for s, c in zip(states, cells, strict=True)
-        ]
-    )
-    assert (solve_batch(levels).status == Status.UNSOLVABLE).all()
+    assert (solve_batch(as_levels(samples.take(dead))).status == Status.UNSOLVABLE).all()
     alive = samples.right != 0
     assert (samples.dead[alive] & samples.right[alive] == 0).all()
     assert (samples.dead & ~samples.dead_known == 0).all()
+
+
+def test_verdicts_on_pushes_are_what_the_solver_finds(samples):
+    shown = samples.take(np.flatnonzero(samples.right)[::40])
+    planes = make_batch(shown, np.zeros(len(shown.agent), np.int64))
+    legal = legal_pushes(input_planes(planes.state), propagate(input_planes(planes.state))[:, 0]) > 0.5
+    missed = (planes.push_known & ~legal).sum() / planes.push_known.sum()
+    assert missed < 0.01  # `propagate` does not follow the longest walks to their end
+    assert (planes.push_known.sum() / legal.sum()) > 0.95
+    levels = as_levels(shown)
+    deadly = 0
+    for row, direction, r, c in planes.push_known.nonzero().tolist():
+        level = take_levels(levels, np.array([row]))
+        box = (level.boxes[0] == (r + 1, c + 1)).all(1)
+        moved = level.boxes.copy()
+        moved[0, box] += OFFSETS_RC[direction + 1]
+        lost = solve_batch(level._replace(boxes=moved, player=np.array([[r + 1, c + 1]]))).status[0] != Status.SOLVED
+        assert lost == bool(planes.push_dead[row, direction, r, c])
+        deadly += lost
+    assert deadly > 10
 
 
 def test_deadly_instruction_labels_nothing_else(levels):
@@ -100,6 +126,8 @@ def test_deadly_instruction_labels_nothing_else(levels):
     samples = label_deadly(part, np.array([1, 3]))
     assert samples.dead.tolist() == [2, 8]
     assert samples.dead_known.tolist() == [3, 9]
+    assert np.bitwise_count(samples.push_dead).sum(1).tolist() == [1, 1]
+    assert (samples.push_known == samples.push_dead).all()
     assert not samples.right.any()
 
 
