@@ -8,51 +8,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import goal_offsets, privileged_features
+from mujoban_controller.goal_features import privileged_features
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.privileged import PrivilegedPolicy
-from mujoban_sim.goals import GoalKind, GoalTracker
+from mujoban_controller.scripted import scripted_driver
 from mujoban_sim.interfaces import Controller, Memory, renew_rows
-from mujoban_sim.oracles import DrivingGains, drive
 
 Driver = Callable[[GoalTask], NDArray[np.float32]]
 """Torques in [-1, 1] for the task's current tick, [B, U]."""
-
-SCRIPTED_GAINS = DrivingGains(
-    roll_feed_forward=0.5, roll_gain=1.0, braking=3.3, lane_tolerance=0.3, look_ahead=0.5
-)
-"""Gains of the scripted teacher.
-
-It makes up for damping, so it is faster than the oracle's defaults. It bends back to its lane smoothly instead of
-turning round 0.12 cells off it: a student that is not sure on which side of such a threshold it is cannot imitate
-what flips there. It never stops short of its goal, since a student that does, by mistake, would stand there for good.
-"""
-HOLD_RADIUS = 0.06
-"""Distance in cells from the centre within which the scripted teacher stands still when it is to hold."""
-OVERSHOT = 0.1
-"""Cells past the goal of a move beyond which the scripted teacher comes back."""
-
-
-def scripted_driver(task: GoalTask, offset: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
-    """Return the scripted driver's torques, [B, 2]; it knows where everything is.
-
-    Args:
-        task: Where it drives.
-        offset: Metres by which it misses its targets, [B, 2].
-    """
-    world, gains = task.world, SCRIPTED_GAINS
-    goals = GoalTracker(world.batch, cell_size=world.body.cell_size)
-    goals.restore(world.goals.memory())
-    to_target = goal_offsets(world)[:, :2]
-    overshot = (goals.kind == GoalKind.MOVE) & (to_target[:, 0] < -OVERSHOT)
-    goals.kind[overshot] = GoalKind.HOLD
-    if offset is not None:
-        goals.robot_target += offset
-    torque = drive(goals, world.truth(), gains)
-    # The course to a centre that is reached already is noise, which a student could only learn as such.
-    holding = (goals.kind == GoalKind.HOLD) & (np.linalg.norm(to_target, axis=1) < HOLD_RADIUS)
-    brake = np.stack([-gains.roll_gain * task.forward_speed, -gains.steer_damping * world.velocity[:, 2]], 1)
-    return np.where(holding[:, None], np.clip(brake, -1.0, 1.0), torque).astype(np.float32)
 
 
 class WanderingDriver:
