@@ -22,10 +22,10 @@ from mujoban_planner.lessons import LessonMaker, LessonProcess
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch, SampleBuffer, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
+from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares, solve_rates
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
 from mujoban_rl.weights import provenance, save_weights
-from mujoban_sim.grid import AGENT, BOX, TARGET, WALL
 
 _STOCK_BATCHES = 800
 """Batches of demonstrations kept ahead, and learned from before the planner's own play is worth correcting."""
@@ -63,7 +63,9 @@ class ImitationConfig(NetworkConfig):
     init: str | None = None
     """Weights to start from, where names and shapes agree."""
     noise: float = 0.1
-    """Share of a batch whose abstract states are made uncertain, as estimates are."""
+    """Share of a batch whose abstract states are blurred, as estimates are."""
+    hidden: float = 0.25
+    """Share of a batch that shows only what the robot may have seen so far."""
     mix: Shares = (0.03, 0.04, 0.06, 0.12, 0.75)
     """Shares of difficulties 1 to 5 among the training levels."""
     buffer: int = 2_000_000
@@ -109,38 +111,6 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: ImitationConfig) ->
     parts = {"policy": policy, "accuracy": accuracy, "push": push, "push_accuracy": best.sum() / n}
     parts |= {"plan": plan, "dead": dead, "dead_recall": caught, "q": q}
     return loss, {k: v.detach() for k, v in parts.items()}
-
-
-def make_uncertain(state: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Return states of which a share is blurred as estimates are: soft values, and cells not seen yet.
-
-    Args:
-        state: Binary abstract states, [B, N, N, 4]; a copy is changed.
-        share: Share of the batch.
-        generator: CPU source of randomness.
-    """
-    n = int(len(state) * share)
-    if n == 0:
-        return state
-    soft = state[:n].clone()
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator).to(state.device)
-
-    # Every value moves towards its opposite by less than one half; how much differs per state.
-    blur = 0.45 * uniform(n, 1, 1, 1) * uniform(*soft.shape) ** 2
-    unseen = uniform(n, *soft.shape[1:3]) < 0.15 * uniform(n, 1, 1)
-    unseen &= soft[..., AGENT] == 0
-    blur[..., AGENT] *= 0.5
-    soft = soft + blur * (1.0 - 2.0 * soft)
-    prior = soft.new_tensor([0.5, 0.06, 0.0, 0.06])
-    for channel in (WALL, TARGET, BOX):
-        # Boxes and targets that were never seen cannot be planned for; what is there may be uncertain, not gone.
-        hide = unseen & (state[:n, ..., BOX] == 0) & (state[:n, ..., TARGET] == 0)
-        soft[..., channel] = torch.where(hide, prior[channel], soft[..., channel])
-    soft[:, [0, -1], :, WALL] = 1.0
-    soft[:, :, [0, -1], WALL] = 1.0
-    return torch.cat([soft, state[n:]])
 
 
 class ImitationTrainer:
@@ -295,7 +265,8 @@ class ImitationTrainer:
         batch = make_batch(concatenate(parts), self.rng.integers(0, SYMMETRIES, config.batch_size)).to(self.device)
         order = torch.randperm(config.batch_size, generator=self.generator).to(self.device)
         batch = Batch._make(x[order] for x in batch)
-        batch = batch._replace(state=make_uncertain(batch.state, config.noise, self.generator))
+        state = blur(batch.state, config.noise, self.generator)
+        batch = batch._replace(state=hide_unseen(state, config.hidden, self.rng))
         for group in self.optimiser.param_groups:
             group["lr"] = config.learning_rate * self._schedule()
         with torch.autocast(self.device.type, torch.bfloat16):

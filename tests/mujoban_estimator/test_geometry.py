@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mujoban_estimator.geometry import CELLS, cell_geometry
-from mujoban_estimator.visibility import cells_in_view
+from mujoban_sim.visibility import cells_in_view
 from mujoban_sim.bodies import BALL
 from mujoban_sim.camera import project
 from mujoban_sim.grid import GRID_SIZE, cell_to_xy

@@ -8,10 +8,11 @@ import torch
 
 import mujoban_planner
 from mujoban_planner import bag_transitions, train
-from mujoban_planner.imitation import ImitationConfig, ImitationTrainer, imitation_loss, make_uncertain
+from mujoban_planner.imitation import ImitationConfig, ImitationTrainer, imitation_loss
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.reinforcement import LevelStream, MPOConfig, MPOTrainer, reset_stay_logit
 from mujoban_planner.samples import make_batch
+from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_rl.weights import WeightsError
 from mujoban_sim.generator import TRAIN_SEEDS
 from mujoban_sim.grid import AGENT, BOX, TARGET, WALL
@@ -69,13 +70,28 @@ def test_a_small_batch_can_be_learned_by_heart():
 def test_uncertain_states_keep_boxes_targets_and_robot_recognisable():
     samples = LessonMaker(0, {5: 1.0}).demonstrations(8)
     batch = make_batch(samples, np.zeros(len(samples.agent), np.int64))
-    soft = make_uncertain(batch.state, 1.0, torch.Generator().manual_seed(0))
+    soft = blur(batch.state, 1.0, torch.Generator().manual_seed(0))
     assert soft.min() >= 0.0 and soft.max() <= 1.0 and not torch.equal(soft, batch.state)
     for layer in (TARGET, BOX):
         assert (soft[..., layer][batch.state[..., layer] > 0] > 0.5).all()
     assert torch.equal(soft[..., AGENT].flatten(1).argmax(1), batch.state[..., AGENT].flatten(1).argmax(1))
     assert (soft[:, [0, -1], :, WALL] == 1).all()
-    assert torch.equal(make_uncertain(batch.state, 0.0, torch.Generator()), batch.state)
+    assert torch.equal(blur(batch.state, 0.0, torch.Generator()), batch.state)
+
+
+def test_hidden_states_show_what_was_in_view_and_guess_the_rest():
+    samples = LessonMaker(0, {5: 1.0}).demonstrations(8)
+    batch = make_batch(samples, np.zeros(len(samples.agent), np.int64))
+    hidden = hide_unseen(batch.state, 1.0, np.random.default_rng(0))
+    shown = (hidden == batch.state).all(-1)
+    inner = shown[:, 1:-1, 1:-1].float().mean((1, 2))
+    assert inner.min() < 0.3 and inner.max() > 0.5
+    assert torch.equal(hidden[..., AGENT], batch.state[..., AGENT])
+    assert shown.flatten(1).gather(1, batch.state[..., AGENT].flatten(1).argmax(1, keepdim=True)).all()
+    assert hidden[~shown][:, [TARGET, BOX]].max() < 0.5
+    assert (hidden[:, [0, -1], :, WALL] == 1).all()
+    half = hide_unseen(batch.state, 0.5, np.random.default_rng(0))
+    assert torch.equal(half[: len(half) // 2], batch.state[: len(half) // 2])
 
 
 def test_mpo_resumes_and_writes_a_loadable_planner(tmp_path):

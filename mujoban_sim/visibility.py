@@ -1,4 +1,4 @@
-"""Which cells of the map a robot's camera has in view: for weighting the loss and for reporting, never an input."""
+"""Which cells of the map a robot's camera has in view: for training and for reporting, never a module's input."""
 
 from __future__ import annotations
 

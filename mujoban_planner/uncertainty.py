@@ -1,0 +1,107 @@
+"""Abstract states as the planner really sees them: estimates are soft, and what was never in view is a guess.
+
+Demonstrations know the whole level. What they do, averaged over all that may be hidden, is what a planner learns to do
+with a part of it: to go and look for the boxes it misses, and not to push where it cannot know.
+
+Shapes: B batch, N = `grid.GRID_SIZE`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mujoban_sim.bodies import BALL
+from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
+from mujoban_sim.visibility import cells_in_view
+
+_VIEWS = 6
+"""Most views that a hidden state is put together from."""
+_UNSEEN = {WALL: (0.82, 0.7), TARGET: (0.024, 0.02), BOX: (0.03, 0.008)}
+"""Layer -> median of the estimator's answer in cells that were never in view, where it is set and where it is not."""
+_SCATTER = 0.7
+"""Standard deviation of these answers, as logits."""
+
+
+def blur(state: Tensor, share: float, generator: torch.Generator) -> Tensor:
+    """Return states of which the first share is blurred as estimates are: soft values, and single cells not seen.
+
+    Args:
+        state: Binary abstract states, [B, N, N, 4]; a copy is changed.
+        share: Share of the batch, from its start.
+        generator: CPU source of randomness.
+    """
+    n = int(len(state) * share)
+    if n == 0:
+        return state
+    soft = state[:n].clone()
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator).to(state.device)
+
+    # Every value moves towards its opposite by less than one half; how much differs per state.
+    blur = 0.45 * uniform(n, 1, 1, 1) * uniform(*soft.shape) ** 2
+    unseen = uniform(n, *soft.shape[1:3]) < 0.15 * uniform(n, 1, 1)
+    unseen &= soft[..., AGENT] == 0
+    blur[..., AGENT] *= 0.5
+    soft = soft + blur * (1.0 - 2.0 * soft)
+    prior = soft.new_tensor([0.5, 0.06, 0.0, 0.06])
+    for channel in (WALL, TARGET, BOX):
+        # Boxes and targets that were never seen cannot be planned for; what is there may be uncertain, not gone.
+        hide = unseen & (state[:n, ..., BOX] == 0) & (state[:n, ..., TARGET] == 0)
+        soft[..., channel] = torch.where(hide, prior[channel], soft[..., channel])
+    soft[:, [0, -1], :, WALL] = 1.0
+    soft[:, :, [0, -1], WALL] = 1.0
+    return torch.cat([soft, state[n:]])
+
+
+def hide_unseen(state: Tensor, share: float, rng: np.random.Generator) -> Tensor:
+    """Return states of which the last share shows only what a robot may have seen; the rest is the estimator's guess.
+
+    What it may have seen are a few views from its cell and from others on its way, such as a turn on the spot.
+
+    Args:
+        state: Abstract states, [B, N, N, 4]; a copy is changed.
+        share: Share of the batch, from its end.
+        rng: Source of the views and guesses.
+    """
+    n = int(len(state) * share)
+    if n == 0:
+        return state
+    part = state[len(state) - n :].cpu().numpy()
+    unseen = ~_seen(part > 0.5, rng)
+    guess = part.copy()
+    for layer, (present, absent) in _UNSEEN.items():
+        odds = np.where(part[..., layer] > 0.5, _logit(present), _logit(absent))
+        noise = rng.normal(0.0, _SCATTER, odds.shape)
+        guess[..., layer] = 1.0 / (1.0 + np.exp(-odds - noise))
+    hidden = np.where(unseen[..., None], guess, part).astype(np.float32)
+    hidden[..., AGENT] = part[..., AGENT]
+    return torch.cat([state[: len(state) - n], torch.from_numpy(hidden).to(state.device)])
+
+
+def _logit(probability: float) -> float:
+    return float(np.log(probability / (1.0 - probability)))
+
+
+def _seen(state: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Return which cells a robot has had in view after some views, [B, N, N]; the border is always known."""
+    n = len(state)
+    floor = ~state[..., WALL].reshape(n, -1) & ~state[..., BOX].reshape(n, -1)
+    here = state[..., AGENT].reshape(n, -1).argmax(1)
+    # A random floor cell per view: the greatest of random numbers.
+    elsewhere = (rng.random((n, _VIEWS, floor.shape[1])) * floor[:, None]).argmax(2)
+    stays = rng.random((n, _VIEWS)) < rng.random((n, 1))
+    stays[:, 0] = True
+    cell = np.where(stays, here[:, None], elsewhere)
+    heading = 0.5 * np.pi * rng.integers(0, 4, cell.shape) + rng.normal(0.0, 0.2, cell.shape)
+    half = (GRID_SIZE - 1) / 2
+    x, y = cell % GRID_SIZE - half, half - cell // GRID_SIZE
+    pose = np.stack([x, y, heading], -1).reshape(-1, 3)
+    wall = np.repeat(state[..., WALL], _VIEWS, axis=0)
+    view = cells_in_view(wall, pose, BALL.camera).reshape(n, _VIEWS, GRID_SIZE, GRID_SIZE)
+    count = rng.integers(1, _VIEWS + 1, (n, 1))
+    border = np.pad(np.zeros((GRID_SIZE - 2, GRID_SIZE - 2), np.bool_), 1, constant_values=True)
+    return np.any(view & (np.arange(_VIEWS) < count)[..., None, None], axis=1) | border
