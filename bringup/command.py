@@ -15,6 +15,7 @@ from mujoban_rl.weights import WeightsError, digest
 from mujoban_sim.episodes import Episodes
 from mujoban_sim.grid import DIFFICULTIES
 from mujoban_sim.interfaces import Module
+from mujoban_sim.look_around import LOOK_AROUND_TICKS, look_around
 from mujoban_sim.plugins import LEARNED, ORACLE, ROLES, load_module, shipped_weights
 from mujoban_sim.rendering import RenderingError
 from mujoban_sim.sense_plan_act import SensePlanAct
@@ -90,10 +91,25 @@ class Stack:
 
     choices: dict[str, Choice] = field(default_factory=lambda: {role: Choice(role) for role in ROLES})
     device: str = "cpu"
+    look_around: int | None = None
+    """Ticks of looking around at the start of an episode; None: `LOOK_AROUND_TICKS`, or 0 for the oracle estimator."""
+
+    @property
+    def look_around_ticks(self) -> int:
+        """Ticks of looking around at the start of an episode."""
+        if self.look_around is not None:
+            return self.look_around
+        return 0 if self.choices["estimator"].source == ORACLE else LOOK_AROUND_TICKS
 
     def policy(self) -> SensePlanAct:
-        """Return the modules composed into one policy."""
-        return SensePlanAct(**{role: choice.load(self.device) for role, choice in self.choices.items()})  # pyright: ignore
+        """Return the modules composed into one policy.
+
+        Raises:
+            ValueError: If a module cannot be loaded, or `look_around` is negative.
+        """
+        modules = {role: choice.load(self.device) for role, choice in self.choices.items()}
+        ticks = self.look_around_ticks
+        return SensePlanAct(**{role: look_around(module, ticks) for role, module in modules.items()})  # pyright: ignore
 
     def identities(self) -> dict[str, str]:
         """Return what identifies each module in a report."""
@@ -131,6 +147,13 @@ def add_module_options(parser: argparse.ArgumentParser) -> None:
             help=f"weights (.safetensors) of the learned {role}, or a class of your own to play it",
         )
     parser.add_argument("--device", default="cpu", help="device of the learned modules")
+    parser.add_argument(
+        "--look-around",
+        type=int,
+        metavar="TICKS",
+        help=f"turn on the spot for so long before the first decision; {LOOK_AROUND_TICKS} by default, "
+        "0 for the oracle estimator",
+    )
 
 
 def episodes_from(arguments: argparse.Namespace) -> Episodes:
@@ -155,7 +178,7 @@ def stack_from(arguments: argparse.Namespace) -> Stack:
         if role not in ROLES:
             raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
         choices[role] = Choice(role, ORACLE)
-    return Stack(choices, arguments.device)
+    return Stack(choices, arguments.device, arguments.look_around)
 
 
 def import_from_here(path: Sequence[str] = ("",)) -> None:

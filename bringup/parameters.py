@@ -59,5 +59,6 @@ def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Para
             "module": choice.source,
             "weights": "" if choice.weights is None else str(choice.weights),
             "device": stack.device,
+            "look_around": stack.look_around_ticks,
         }
     return parameters

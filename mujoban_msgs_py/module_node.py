@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.tick_node import Input, Output, TickNode
 from mujoban_sim.interfaces import GroundTruth
+from mujoban_sim.look_around import look_around
 from mujoban_sim.plugins import LEARNED, load_module
 
 TRUTH_INPUTS = (
@@ -36,6 +37,8 @@ class ModuleNode(TickNode):
             runs loads them, and the module's memory restarts with the next tick. Weights that cannot be loaded
             are refused, and the old ones stay.
         device: Device of the learned module; setting it loads the weights again.
+        look_around: Ticks at the start of an episode in which planner and controller let the robot turn on the spot
+            before the planner's first decision; fixed when the node starts.
     """
 
     role: ClassVar[str]
@@ -53,6 +56,8 @@ class ModuleNode(TickNode):
         self._source: str = source
         weights: Any = self.declare_parameter("weights", "").value
         device: Any = self.declare_parameter("device", "cpu").value
+        ticks: Any = self.declare_parameter("look_around", 0, ParameterDescriptor(read_only=True)).value
+        self._look_around: int = ticks
         self.module: Any = self._load(weights, device)
         self.state: Any = None
         self._episode = -1
@@ -82,7 +87,8 @@ class ModuleNode(TickNode):
         return self.step(episode, inputs, truth)
 
     def _load(self, weights: str, device: str) -> Any:
-        return load_module(self.role, self._source, Path(weights) if weights else None, device)
+        module = load_module(self.role, self._source, Path(weights) if weights else None, device)
+        return look_around(module, self._look_around)
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         changed = {p.name: p.value for p in parameters}
