@@ -45,19 +45,20 @@ def test_oracles_do_the_same_in_the_graph_as_in_process(play_graph, oracles):
 
 
 def test_networks_do_the_same_in_the_graph_as_in_process(play_graph, fresh_weights):
-    assert_equal_runs(play_graph, fresh_weights, Episodes(2, 5, difficulty=3), 40)
+    stack = Stack(fresh_weights.choices, look_around=10)
+    assert_equal_runs(play_graph, stack, Episodes(2, 5, difficulty=3), 40)
 
 
 @pytest.mark.parametrize("role", ["estimator", "termination", "controller"])
 def test_one_network_among_oracles_does_the_same(play_graph, oracles, fresh_weights, role):
-    stack = Stack(oracles.choices | {role: fresh_weights.choices[role]})
+    stack = Stack(oracles.choices | {role: fresh_weights.choices[role]}, look_around=5)
     assert_equal_runs(play_graph, stack, Episodes(1, 7, difficulty=1), 25)
 
 
 def test_two_runs_of_the_graph_are_equal(play_graph, fresh_weights):
     runs = []
     for _ in range(2):
-        graph = play_graph(fresh_weights, Episodes(1, 9, difficulty=2), time_limit=20)
+        graph = play_graph(Stack(fresh_weights.choices, look_around=5), Episodes(1, 9, difficulty=2), time_limit=20)
         graph.finish()
         runs.append((graph.said.instruction, graph.said.torque, graph.said.reward))
         graph.__exit__(None, None, None)
