@@ -1,15 +1,19 @@
 """The node that streams the graph to Rerun (`python -m bringup.live`), for a viewer in the browser or a file.
 
-It only subscribes, so it works beside a stack in another process and on a bag that is played back. `rerun-sdk` is an
-optional dependency: `pip install 'mujoban[view]'`.
+It only subscribes, so it works beside a stack in another process and on a bag that is played back. It must not hold up
+the graph either: it runs at low priority, drops what it has no time for, and draws a few pictures a second.
+`rerun-sdk` is an optional dependency: `pip install 'mujoban[view]'`.
 """
 
 from __future__ import annotations
 
+import os
+import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -17,57 +21,90 @@ import rerun.blueprint as rrb
 from mujoban_msgs.msg import AbstractState, Episode, Instruction, Termination
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
 
+from bringup.overlay import grid_picture
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.tick_node import live_qos, run_node
+from mujoban_msgs_py.topics import TICK, Topic
 from mujoban_sim.grid import CHANNELS
 from mujoban_sim.grid import Instruction as Direction
 
 APPLICATION: Final = "mujoban"
-_PERIOD: Final = 2
-"""Ticks between two pictures: 10 Hz is enough for the eye."""
-_COLOURS: Final = np.array([[150, 140, 140], [200, 30, 30], [40, 90, 230], [230, 200, 30]], np.float32)
-"""RGB of the layers wall, target, agent, box."""
+NICENESS: Final = 10
+"""Of the node's process: the graph comes first."""
+_PERIOD: Final = 0.1
+"""Seconds between two pictures: 10 Hz is enough for the eye."""
+_QUEUE: Final = 16
+"""Ticks that wait for the stream; what comes on top is dropped."""
+_EDGE: Final = 256
+"""Pixels along the edge of a picture at most."""
+_MEMORY: Final = "256MiB"
+"""What the stream keeps for a browser that opens the page later."""
+_PORTS: Final = 50
+"""Ports that are tried for one that is free."""
+_MODULES: Final = {
+    topics.ABSTRACT_STATE: "estimator",
+    topics.TERMINATION: "termination",
+    topics.INSTRUCTION: "planner",
+    topics.TORQUE: "controller",
+}
+
+
+class _Received(NamedTuple):
+    """When a message was received."""
+
+    stamp: int
+    """Of the tick [ns of simulated time]."""
+    at: float
+    """Wall time [s]."""
 
 
 class LiveNode(Node):
     """Logs cameras, grids, instruction, beta, torques, reward and the time that each module takes.
 
+    A module's time runs from the message of the same tick that came before its own: where all nodes share one process
+    it is the module's own; the simulator's runs from one tick's torque to the last of the next tick's observation. Both
+    are wall time as this node sees it: an EventsExecutor has no time of publication.
+
     Parameters:
         save: Recording (.rrd) to write; empty streams to a viewer.
-        grpc_port: Port on which the stream is served.
-        web_port: Port on which the viewer's page is served.
+        grpc_port: Port on which the stream is served, or the next free one.
+        web_port: Port on which the viewer's page is served, or the next free one.
     """
 
     def __init__(self, **options: Any) -> None:
         """Open the stream and start listening."""
         super().__init__("live", **options)
         fixed = ParameterDescriptor(read_only=True)
-        save = self.declare_parameter("save", "", fixed).value
-        grpc_port = self.declare_parameter("grpc_port", 9876, fixed).value
-        web_port = self.declare_parameter("web_port", 9090, fixed).value
+        save: Any = self.declare_parameter("save", "", fixed).value
+        grpc_port: Any = self.declare_parameter("grpc_port", 9876, fixed).value
+        web_port: Any = self.declare_parameter("web_port", 9090, fixed).value
         self._stream = rr.RecordingStream(APPLICATION)
+        self._period = 0.0 if save else _PERIOD
         if save:
             self._stream.save(save, default_blueprint=blueprint())
         else:
-            address = self._stream.serve_grpc(grpc_port=grpc_port, default_blueprint=blueprint())
-            rr.serve_web_viewer(web_port=web_port, open_browser=False, connect_to=address)
-            self.get_logger().info(f"live view on http://localhost:{web_port}/?url={address.replace('+', '%2B')}")
-        self._offered: dict[int, float] = {}
-        handlers: dict[topics.Topic, Callable[[Any], None]] = {
+            self._serve(free_port(grpc_port), free_port(web_port))
+        self._pictured, self._drawn = -1, 0.0
+        self._latest = _Received(-1, 0.0)
+        self._torque = _Received(-1, 0.0)
+        self._sequence = -1
+        handlers: dict[Topic, Callable[[int, Any], None]] = {
             topics.EPISODE: self._on_episode,
-            topics.CAMERA: lambda m: self._on_image("camera/first_person", m),
-            topics.TOP_CAMERA: lambda m: self._on_image("camera/top_down", m),
-            topics.ABSTRACT_STATE: lambda m: self._on_grid("grid/estimate", m),
-            topics.TRUE_ABSTRACT_STATE: lambda m: self._on_grid("grid/ground_truth", m),
+            topics.CAMERA: partial(self._on_image, "camera/first_person"),
+            topics.TRUE_ABSTRACT_STATE: partial(self._on_grid, "grid/ground_truth"),
+            topics.TOP_CAMERA: partial(self._on_image, "camera/top_down"),
+            topics.ABSTRACT_STATE: partial(self._on_grid, "grid/estimate"),
             topics.TERMINATION: self._on_termination,
             topics.INSTRUCTION: self._on_instruction,
             topics.TORQUE: self._on_torque,
         }
-        self._sequence = -1
-        for topic, handler in handlers.items():
-            self.create_subscription(topic.type, topic.name, handler, live_qos())
+        qos = live_qos() if save else QoSProfile(depth=_QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT)
+        for topic, handle in handlers.items():
+            self.create_subscription(topic.type, topic.name, self._receiver(topic, handle), qos, raw=True)
 
     def destroy_node(self) -> None:
         """Finish the stream; a recording is whole only then."""
@@ -75,63 +112,92 @@ class LiveNode(Node):
         self._stream.disconnect()
         super().destroy_node()
 
-    def _at(self, message: Any) -> int:
-        stamp = conversions.stamp_of(message)
-        self._stream.set_time("simulated_time", duration=stamp / 1e9)
-        return stamp
+    def _serve(self, grpc_port: int, web_port: int) -> None:
+        address = self._stream.serve_grpc(
+            grpc_port=grpc_port, default_blueprint=blueprint(), server_memory_limit=_MEMORY
+        )
+        rr.serve_web_viewer(web_port=web_port, open_browser=False, connect_to=address)
+        self.get_logger().info(f"live view on http://localhost:{web_port}/?url={address.replace('+', '%2B')}")
 
-    def _log_delay(self, module: str, stamp: int) -> None:
-        """Log the wall time from the offer of a tick to a module's answer."""
-        offered = self._offered.get(stamp)
-        if offered is not None:
-            self._stream.log(f"milliseconds/{module}", rr.Scalars(1000 * (time.perf_counter() - offered)))
+    def _receiver(self, topic: Topic, handle: Callable[[int, Any], None]) -> Callable[[bytes], None]:
+        is_picture = topic.type in (Image, AbstractState)
 
-    def _on_episode(self, message: Episode) -> None:
-        stamp = self._at(message)
-        self._offered = {stamp: time.perf_counter()}
+        def receive(message: bytes) -> None:
+            stamp = raw_stamp(message)
+            self._stream.set_time("simulated_time", duration=stamp / 1e9)
+            self._log_time(topic, _Received(stamp, time.perf_counter()))
+            if not is_picture or self._is_drawn(stamp):
+                handle(stamp, read(message, topic.type))
+
+        return receive
+
+    def _is_drawn(self, stamp: int) -> bool:
+        """Tell whether the pictures of a tick are shown: every other tick's, and not more often than `_PERIOD`."""
+        now = time.monotonic()
+        if stamp != self._pictured and stamp // TICK % 2 == 0 and now - self._drawn >= self._period:
+            self._pictured, self._drawn = stamp, now
+        return stamp == self._pictured
+
+    def _log_time(self, topic: Topic, received: _Received) -> None:
+        """Log how long after the message before it an answer came."""
+        before, self._latest = self._latest, received
+        module = _MODULES.get(topic)
+        if module is None or received.stamp != before.stamp:
+            return
+        self._log_milliseconds(module, before, received)
+        if module == "estimator" and received.stamp == self._torque.stamp + TICK:
+            self._log_milliseconds("simulator", self._torque, before)
+        if module == "controller":
+            self._torque = received
+
+    def _log_milliseconds(self, what: str, start: _Received, end: _Received) -> None:
+        self._stream.log(f"milliseconds/{what}", rr.Scalars(1000 * (end.at - start.at)))
+
+    def _on_episode(self, stamp: int, message: Episode) -> None:
         self._stream.log("reward/step", rr.Scalars(message.reward))
         self._stream.log("reward/return", rr.Scalars(message.episode_return))
 
-    def _on_image(self, entity: str, message: Image) -> None:
-        if self._at(message) // topics.TICK % _PERIOD == 0:
-            self._stream.log(entity, rr.Image(conversions.frame_from_msg(message, None)))
+    def _on_image(self, entity: str, stamp: int, message: Image) -> None:
+        frame = conversions.frame_from_msg(message, None)
+        stride = -(-frame.shape[0] // _EDGE)
+        self._stream.log(entity, rr.Image(frame[::stride, ::stride]))
 
-    def _on_grid(self, entity: str, message: AbstractState) -> None:
-        stamp = self._at(message)
-        if entity.endswith("estimate"):
-            self._log_delay("estimator", stamp)
-        if stamp // topics.TICK % _PERIOD:
-            return
+    def _on_grid(self, entity: str, stamp: int, message: AbstractState) -> None:
         state = conversions.abstract_state_from_msg(message)
-        self._stream.log(entity, rr.Image(picture(state)))
+        self._stream.log(entity, rr.Image(grid_picture(state)))
         for channel, name in enumerate(CHANNELS):
             self._stream.log(f"{entity}/{name}", rr.DepthImage(state[..., channel], meter=1.0))
 
-    def _on_termination(self, message: Termination) -> None:
-        self._log_delay("termination", self._at(message))
+    def _on_termination(self, stamp: int, message: Termination) -> None:
         self._stream.log("beta/probability", rr.Scalars(message.probability))
         self._stream.log("beta/terminated", rr.Scalars(float(message.terminated)))
 
-    def _on_instruction(self, message: Instruction) -> None:
-        self._log_delay("planner", self._at(message))
+    def _on_instruction(self, stamp: int, message: Instruction) -> None:
         self._stream.log("instruction", rr.Scalars(message.direction))
         if message.sequence != self._sequence:
             self._sequence = message.sequence
             name = Direction(message.direction).name.lower()
             self._stream.log("instructions", rr.TextLog(f"{message.sequence}: {name}"))
 
-    def _on_torque(self, message: JointState) -> None:
-        self._log_delay("controller", self._at(message))
+    def _on_torque(self, stamp: int, message: JointState) -> None:
         self._stream.log("torque", rr.Scalars(np.array(message.effort)))
 
 
-def picture(state: np.ndarray) -> np.ndarray:
-    """Return an abstract state, probabilities [N, N, 4], as colours, uint8 [N, N, 3]."""
-    weight = state[..., None]
-    canvas = np.full((*state.shape[:2], 3), 30.0, np.float32)
-    for channel in range(len(CHANNELS)):
-        canvas = (1 - weight[:, :, channel]) * canvas + weight[:, :, channel] * _COLOURS[channel]
-    return canvas.astype(np.uint8)
+def free_port(first: int) -> int:
+    """Return the first port from `first` on that nobody listens on.
+
+    Raises:
+        OSError: If there is none near.
+    """
+    for port in range(first, first + _PORTS):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("", port))
+            except OSError:
+                continue
+            return port
+    raise OSError(f"the ports from {first} to {first + _PORTS - 1} are all taken")
 
 
 def blueprint() -> rrb.Blueprint:
@@ -151,12 +217,14 @@ def blueprint() -> rrb.Blueprint:
                 rrb.TimeSeriesView(origin="milliseconds", name="milliseconds"),
                 rrb.TextLogView(origin="instructions", name="instructions"),
             ),
-        )
+        ),
+        collapse_panels=True,
     )
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
+    os.nice(NICENESS)
     return run_node(LiveNode, args)
 
 

@@ -1,24 +1,44 @@
-"""The node that makes a video: what the robot sees beside the view from above."""
+"""The node that makes a video: what the robot sees beside the view from above, and what the modules say of it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
-from sensor_msgs.msg import Image
 
+from bringup.overlay import Said, draw
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.tick_node import live_qos
 from mujoban_sim.grid import CONTROL_PERIOD
 
-EDGE = 384
+EDGE: Final = 384
 """Pixels along the edges of each of the two pictures; a multiple of 16, as H.264 wants it."""
+PATIENCE: Final = 16
+"""Pictures that wait at most for what the modules say: in real time an answer may never come."""
+
+_frame = partial(conversions.frame_from_msg, size=None)
+_SEEN: Final = {topics.CAMERA: _frame, topics.TOP_CAMERA: _frame, topics.EPISODE: conversions.episode_from_msg}
+_SAID: Final = {
+    topics.INSTRUCTION: conversions.instruction_from_msg,
+    topics.TERMINATION: conversions.termination_from_msg,
+    topics.ABSTRACT_STATE: conversions.abstract_state_from_msg,
+}
+
+
+class _Picture(NamedTuple):
+    """A picture without its overlay."""
+
+    pixels: NDArray[np.uint8]
+    step: int
+    last: bool
+    """Whether the episode ended here, so that no module has anything to say."""
 
 
 class VideoNode(Node):
@@ -44,26 +64,64 @@ class VideoNode(Node):
             path, format="FFMPEG", fps=round(1 / CONTROL_PERIOD), codec="libx264", pixelformat="yuv420p",  # pyright: ignore
         )  # fmt: skip
         self.written = 0
-        self._join: Synchroniser[NDArray[np.uint8]] = Synchroniser([topics.CAMERA.name, topics.TOP_CAMERA.name])
-        for topic in (topics.CAMERA, topics.TOP_CAMERA):
-            self.create_subscription(Image, topic.name, self._receiver(topic.name), live_qos(256))
+        self._waiting: dict[int, _Picture] = {}
+        self._said: dict[int, Said] = {}
+        self._latest: Said | None = None
+        for handle, parts in ((self._on_seen, _SEEN), (self._on_said, _SAID)):
+            join: Synchroniser[Any] = Synchroniser([topic.name for topic in parts])
+            for topic, decode in parts.items():
+                receive = self._receiver(join, topic.name, decode, handle)
+                self.create_subscription(topic.type, topic.name, receive, live_qos(256))
 
     def destroy_node(self) -> None:
         """Finish the file."""
+        self._write(patience=0)
         self._writer.close()
         super().destroy_node()
 
-    def _receiver(self, name: str) -> Callable[[Image], None]:
-        def receive(message: Image) -> None:
+    def _receiver(
+        self,
+        join: Synchroniser[Any],
+        name: str,
+        decode: Callable[[Any], Any],
+        handle: Callable[[int, dict[str, Any]], None],
+    ) -> Callable[[Any], None]:
+        def receive(message: Any) -> None:
             stamp = conversions.stamp_of(message)
             if stamp <= self.written:
                 return
-            pictures = self._join.add(name, stamp, conversions.frame_from_msg(message, None))
-            if pictures is not None:
-                self.written = stamp
-                self._writer.append_data(side_by_side(pictures[topics.CAMERA.name], pictures[topics.TOP_CAMERA.name]))
+            parts = join.add(name, stamp, decode(message))
+            if parts is not None:
+                handle(stamp, parts)
+                self._write(PATIENCE)
 
         return receive
+
+    def _on_seen(self, stamp: int, parts: dict[str, Any]) -> None:
+        episode: conversions.EpisodeReading = parts[topics.EPISODE.name]
+        pixels = side_by_side(parts[topics.CAMERA.name], parts[topics.TOP_CAMERA.name])
+        self._waiting[stamp] = _Picture(pixels, episode.step, episode.terminated or episode.truncated)
+
+    def _on_said(self, stamp: int, parts: dict[str, Any]) -> None:
+        instruction: conversions.InstructionReading = parts[topics.INSTRUCTION.name]
+        probability = parts[topics.TERMINATION.name].probability
+        estimate = parts[topics.ABSTRACT_STATE.name]
+        self._said[stamp] = Said(instruction.direction, instruction.sequence, probability, estimate)
+
+    def _write(self, patience: int) -> None:
+        """Write the pictures, in order, whose overlay is known or has been waited for long enough."""
+        while self._waiting:
+            stamp, picture = next(iter(self._waiting.items()))
+            if stamp not in self._said and not picture.last and len(self._waiting) <= patience:
+                return
+            del self._waiting[stamp]
+            self._latest = self._said.get(stamp, self._latest)
+            self._said = {later: said for later, said in self._said.items() if later > stamp}
+            pixels = picture.pixels
+            if self._latest is not None:
+                pixels = np.concatenate([draw(pixels[:, :EDGE], self._latest, picture.step), pixels[:, EDGE:]], axis=1)
+            self._writer.append_data(pixels)
+            self.written = stamp
 
 
 def side_by_side(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -1,5 +1,6 @@
-"""What tools for looking at the graph receive: standard messages, and a Rerun recording."""
+"""What tools for looking at the graph receive: standard messages, a Rerun recording, a video."""
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 from nav_msgs.msg import OccupancyGrid
@@ -7,14 +8,20 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from visualization_msgs.msg import Marker, MarkerArray
 
+from bringup.overlay import BAR, CELL, MARGIN, grid_picture
+from bringup.video import EDGE, VideoNode
 from bringup.viz import VizNode, occupancy_grid
 from mujoban_msgs_py import conversions
 from mujoban_sim.episodes import Episodes
 from mujoban_sim.grid import BOX, TARGET, WALL, cell_to_xy
 
+LAYERS = ("wall", "target", "agent", "box")
 ENTITIES = {
-    "/camera/first_person", "/camera/top_down", "/grid/estimate", "/grid/ground_truth", "/instruction",
-    "/beta/probability", "/torque", "/reward/return", "/milliseconds/estimator", "/milliseconds/controller",
+    "/camera/first_person", "/camera/top_down", "/grid/estimate", "/grid/ground_truth",
+    *(f"/grid/{source}/{layer}" for source in ("estimate", "ground_truth") for layer in LAYERS),
+    "/instruction", "/instructions", "/beta/probability", "/beta/terminated", "/torque", "/reward/step",
+    "/reward/return",
+    *(f"/milliseconds/{what}" for what in ("simulator", "estimator", "termination", "planner", "controller")),
 }  # fmt: skip
 
 
@@ -62,3 +69,23 @@ def test_a_recording_of_the_live_view_holds_every_entity(play_graph, tmp_path):
     graph.finish()
     graph.__exit__(None, None, None)
     assert {part.entity_path for part in chunk.RrdReader(str(file)).stream()} >= ENTITIES
+
+
+def test_a_video_shows_both_views_and_what_the_modules_say(play_graph, tmp_path):
+    file = tmp_path / "film.mp4"
+    episodes = Episodes(1, 0, difficulty=1)
+    graph = play_graph(episodes=episodes)
+    video = graph.graph.add(VideoNode(file))
+    (result,) = graph.finish()
+    graph.spin_until(lambda: video.written == graph.monitor.stamp)
+    graph.__exit__(None, None, None)
+    frames = [np.asarray(frame) for frame in imageio.get_reader(file)]
+    assert len(frames) == result.steps + 1, "one frame a tick, and one of the end"
+    assert {frame.shape for frame in frames} == {(EDGE, 2 * EDGE, 3)}
+    middle = MARGIN + CELL // 2 + CELL * np.arange(10)
+    drawn = frames[0][middle[:, None], middle].astype(int)
+    estimate = grid_picture(episodes[0].level.abstract_state()).astype(int)
+    assert np.abs(drawn - estimate).max() < 60, "the map shows the estimate, but for what compression does to colours"
+    line = frames[0][-BAR:, :EDGE]
+    assert (line > 200).any() and (line < 40).any(), "the instruction is written at the bottom"
+    assert not (frames[0][-BAR:, EDGE:] == frames[0][-BAR:, :EDGE]).all()

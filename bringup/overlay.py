@@ -1,0 +1,72 @@
+"""What is drawn over a video: the instruction in force, p(beta), and the estimate as a small map."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from mujoban_sim.grid import CHANNELS, CONTROL_PERIOD, OFFSETS_RC, Instruction
+
+CELL: Final = 10
+"""Pixels along the edge of a cell of the small map."""
+BAR: Final = 32
+"""Pixels of the line of text at the bottom."""
+MARGIN: Final = 8
+"""Pixels from the corner of the picture to the map."""
+_FONT_SIZE: Final = 18
+_BACKGROUND: Final = 30.0
+_COLOURS: Final = np.array([[150, 140, 140], [200, 30, 30], [40, 90, 230], [230, 200, 30]], np.float32)
+"""RGB of the layers wall, target, agent, box."""
+
+
+class Said(NamedTuple):
+    """What the modules said in a tick."""
+
+    instruction: int
+    sequence: int
+    """Number of the instruction within its episode."""
+    probability: float
+    """p(beta)."""
+    estimate: NDArray[np.float32]
+    """Abstract state, probabilities [N, N, 4]."""
+
+
+def grid_picture(state: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return an abstract state, probabilities [N, N, 4], as colours, [N, N, 3]."""
+    canvas = np.full((*state.shape[:2], 3), _BACKGROUND, np.float32)
+    for channel in range(len(CHANNELS)):
+        weight = state[..., channel, None]
+        canvas = (1 - weight) * canvas + weight * _COLOURS[channel]
+    return canvas.astype(np.uint8)
+
+
+def draw(picture: NDArray[np.uint8], said: Said, step: int) -> NDArray[np.uint8]:
+    """Return the picture, [H, W, 3], with the estimate in its upper left corner and a line of text at the bottom."""
+    image = Image.fromarray(picture)
+    brush = ImageDraw.Draw(image)
+    cells = np.repeat(np.repeat(grid_picture(said.estimate), CELL, axis=0), CELL, axis=1)
+    brush.rectangle((MARGIN - 2, MARGIN - 2, MARGIN + cells.shape[1] + 1, MARGIN + cells.shape[0] + 1), fill="white")
+    image.paste(Image.fromarray(cells), (MARGIN, MARGIN))
+    top = image.height - BAR
+    brush.rectangle((0, top, image.width, image.height), fill=(0, 0, 0))
+    _draw_arrow(brush, (BAR / 2, top + BAR / 2), said.instruction)
+    name = Instruction(said.instruction).name.lower()
+    text = f"{name}, number {said.sequence}    p(beta) {said.probability:.2f}    {step * CONTROL_PERIOD:.1f} s"
+    brush.text((BAR + 4, top + BAR / 2), text, fill="white", anchor="lm", font=ImageFont.load_default(_FONT_SIZE))
+    return np.asarray(image)
+
+
+def _draw_arrow(brush: ImageDraw.ImageDraw, centre: tuple[float, float], instruction: int) -> None:
+    """Draw the instruction's direction as a triangle, north upwards; `stay` is a disc."""
+    x, y = centre
+    down, right = OFFSETS_RC[instruction]
+    size = 0.35 * BAR
+    if instruction == Instruction.STAY:
+        brush.ellipse((x - size / 2, y - size / 2, x + size / 2, y + size / 2), fill="white")
+        return
+    tip = (x + size * right, y + size * down)
+    base = [(x - size * right + side * size * down, y - size * down + side * size * right) for side in (-1, 1)]
+    brush.polygon([tip, *base], fill="white")
