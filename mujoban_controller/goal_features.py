@@ -8,17 +8,34 @@ Shapes: B robots, K boxes, P proprioceptive values, D features.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.goals import GoalKind
+from mujoban_sim.bodies import Body
+from mujoban_sim.goals import GoalKind, GoalTracker
 from mujoban_sim.grid import GRID_SIZE, OFFSETS_XY, cell_to_xy, xy_to_cell
-from mujoban_sim.world import World
 
 _NEIGHBOURS = np.array([[x, y] for x in (-1, 0, 1, 2) for y in (-1, 0, 1) if (x, y) != (0, 0)], np.float64)
 """Cells around the origin cell whose contents matter, (along, left), [11, 2]."""
 GOAL_SIZE = 4
 """Values of `goal_offsets`."""
+
+
+class GoalView(Protocol):
+    """What the features are made of: a `World`, or ticks of a recording."""
+
+    batch: int
+    body: Body
+    goals: GoalTracker
+    wall: NDArray[np.bool_]
+    proprio: NDArray[np.float32]
+    pose: NDArray[np.float32]
+    velocity: NDArray[np.float32]
+    box_position: NDArray[np.float32]
+    box_speed: NDArray[np.float32]
+    box_cell: NDArray[np.int64]
 
 
 def feature_size(proprio_size: int) -> int:
@@ -37,7 +54,7 @@ def _turn(v: NDArray[np.floating], along: NDArray[np.float64], left: NDArray[np.
     return np.stack([(v * along).sum(-1), (v * left).sum(-1)], -1)
 
 
-def goal_offsets(world: World) -> NDArray[np.float32]:
+def goal_offsets(world: GoalView) -> NDArray[np.float32]:
     """Return, in the instruction's frame and in cells, robot to target and pushed box to target, [B, 4].
 
     The box's offset is zero unless the goal is a push.
@@ -50,7 +67,7 @@ def goal_offsets(world: World) -> NDArray[np.float32]:
     return (np.concatenate([robot, box], 1) / world.body.cell_size).astype(np.float32)
 
 
-def privileged_features(world: World, elapsed: NDArray[np.float64]) -> NDArray[np.float32]:
+def privileged_features(world: GoalView, elapsed: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return the critic's view of the state, [B, D].
 
     Args:
@@ -78,7 +95,7 @@ def privileged_features(world: World, elapsed: NDArray[np.float64]) -> NDArray[n
     return np.concatenate(parts, 1).astype(np.float32)
 
 
-def _surroundings(world: World, along: NDArray[np.float64], left: NDArray[np.float64]) -> NDArray[np.float64]:
+def _surroundings(world: GoalView, along: NDArray[np.float64], left: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return whether a wall, and whether a box, is in each of the cells around the origin cell, [B, 22]."""
     rows = np.arange(world.batch)[:, None]
     origin = cell_to_xy(world.goals.origin_cell)
@@ -89,7 +106,7 @@ def _surroundings(world: World, along: NDArray[np.float64], left: NDArray[np.flo
     return np.concatenate([wall, box], 1).astype(np.float64)
 
 
-def drift(world: World, slack: float = 0.04) -> NDArray[np.float64]:
+def drift(world: GoalView, slack: float = 0.04) -> NDArray[np.float64]:
     """Return how far boxes stand off the middle of their cells, or of the lane along which one is pushed, [B].
 
     In cells, summed over boxes and axes, beyond `slack`. A box that coasts past a centre across its next push

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from mujoban_controller.bag_sequences import BagSequences
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.distil import Collector, DistilConfig, Distiller
 from mujoban_controller.drivers import Driver, PrivilegedDriver
@@ -159,11 +160,25 @@ class ReinforcementLearner(Learner[MPOTrainingConfig]):
     """MPO of a privileged teacher or of the camera policy."""
 
     def __init__(
-        self, policy: Policy, task: GoalTask, config: MPOTrainingConfig, rng: np.random.Generator, *, fresh: bool
-    ) -> None:
-        """Train `policy`; `fresh` weights of a camera policy have no normalisation yet."""
+        self, policy: Policy, task: GoalTask, config: MPOTrainingConfig, rng: np.random.Generator, *, fresh: bool,
+        recorded: BagSequences | None = None, recorded_share: float = 0.25,
+    ) -> None:  # fmt: skip
+        """Train `policy`.
+
+        Args:
+            policy: Trained in place.
+            task: Where it acts.
+            config: Settings.
+            rng: Source of all randomness.
+            fresh: Whether the weights of a camera policy have no normalisation yet.
+            recorded: Sequences from bags that join the replay.
+            recorded_share: Their share of what joins it.
+        """
         super().__init__(config, rng)
         self._fresh = fresh
+        self._recorded = recorded
+        batch = task.config.batch
+        self._recorded_count = max(1, round(batch * recorded_share / (1.0 - recorded_share)))
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         self._mpo = MPOLearner(policy, task.config.body, config, generator)
         self._collector = MPOCollector(task, policy, config.length, generator)
@@ -202,6 +217,15 @@ class ReinforcementLearner(Learner[MPOTrainingConfig]):
     @updates.setter
     def updates(self, count: int) -> None:
         self._mpo.updates = count
+
+    def collect(self) -> list[TaskStep]:
+        """Add one sequence per robot, and what there is from bags, to the replay; return what happened."""
+        steps = super().collect()
+        if self._recorded is not None:
+            for _ in range(self._recorded_count):
+                self.replay.add(*next(self._recorded))
+            self._debt += self._recorded_count * self.config.length * self.config.reuse
+        return steps
 
     def _prepare(self, ticks: Mapping[str, NDArray]) -> None:
         policy = self._mpo.policy

@@ -110,9 +110,9 @@ def _push_speed(box_left: NDArray[np.float64], speed: NDArray[np.float32]) -> ND
     return np.where(left < joint / g.push_braking, g.push_braking * left, steady)
 
 
-def _heading_error(course: NDArray[np.floating], heading: NDArray[np.floating]) -> NDArray[np.float64]:
+def _heading_error(course: NDArray[np.floating], heading: NDArray[np.floating]) -> NDArray[np.floating]:
     return _wrap(np.arctan2(course[:, 1], course[:, 0]) - heading)
 
 
-def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+def _wrap(angle: NDArray[np.floating]) -> NDArray[np.floating]:
     return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -2,12 +2,14 @@
 
 The recorded route is `distil`: a privileged teacher is distilled into the camera policy. `teacher` trains a
 privileged policy by MPO, and `mpo` trains the camera policy by MPO with an asymmetric critic (paper C.3), from
-scratch or from distilled weights (`--initial`). Give the directory again to resume a run; its replay fills anew.
+scratch or from distilled weights (`--initial`). With `--bags`, sequences from recorded bags of the running stack
+join the replay of MPO. Give the directory again to resume a run; its replay fills anew.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,6 +19,7 @@ import torch
 import tyro
 from torch import nn
 
+from mujoban_controller.bag_sequences import BagSequences
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.distil import DistilConfig
 from mujoban_controller.drivers import Driver, PrivilegedDriver, scripted_driver
@@ -77,6 +80,10 @@ class Options:
     run: Path
     """Run directory; an existing one is resumed."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
+    bags: tuple[Path, ...] = ()
+    """Recorded bags, or folders of bags, whose transitions join the replay of the stages teacher and mpo."""
+    bag_share: float = 0.25
+    """Share of the replay's new sequences that comes from bags, if there are any."""
     seconds: float | None = None
     """Stop after so many seconds; resume later."""
     evaluate_every: int = 300_000
@@ -87,6 +94,15 @@ class Options:
     device: str = "cpu"
     """Where networks learn; the policy acts there too."""
     threads: int = 1
+
+    def __post_init__(self) -> None:
+        """Reject bags that nothing would learn from."""
+        if self.bags and self.config.stage == "distil":
+            raise ValueError(
+                "--bags: bags lack the labels that distillation learns from; expected --stage mpo or teacher"
+            )
+        if not 0.0 < self.bag_share < 1.0:
+            raise ValueError(f"--bag-share {self.bag_share}: expected a share between 0 and 1")
 
 
 def training_episodes(difficulty: int, rng: np.random.Generator) -> EpisodeSource:
@@ -110,7 +126,10 @@ def _advance(level: Level, rng: np.random.Generator) -> Level:
     return replace(level, boxes=boxes, player=(int(player[0]), int(player[1])))
 
 
-def make_learner(config: TrainConfig, *, threads: int = 1, device: str = "cpu", stream: int = 0) -> Learner[Any]:
+def make_learner(
+    config: TrainConfig, *, threads: int = 1, device: str = "cpu", stream: int = 0,
+    bags: Sequence[Path] = (), bag_share: float = 0.25,
+) -> Learner[Any]:  # fmt: skip
     """Return the learner of a stage, its task started.
 
     Args:
@@ -118,29 +137,43 @@ def make_learner(config: TrainConfig, *, threads: int = 1, device: str = "cpu", 
         threads: Threads for physics.
         device: Device of the networks.
         stream: Random stream of the task, another one after every resumption, so that no episode comes twice.
+        bags: Recorded bags whose sequences join the replay of MPO.
+        bag_share: Their share of the new sequences.
+
+    Raises:
+        BagError: If a bag cannot be used.
     """
     torch.manual_seed(config.seed)
     rng = np.random.default_rng([config.seed, stream])
     episodes = training_episodes(config.task.difficulty, rng)
     task = GoalTask(config.task, OraclePlanner(max_nodes=PLANNER_NODES), episodes, rng, threads=threads)
-    fresh, body = config.initial is None, config.task.body
-    if config.stage == "teacher":
-        weights = config.initial
-        policy = PrivilegedPolicy(body) if weights is None else load_weights(PrivilegedPolicy, weights)
-        return ReinforcementLearner(policy.train().to(device), task, config.mpo, rng, fresh=fresh)
+    if config.stage != "distil":
+        policy = _policy(config).train().to(device)
+        recorded = BagSequences(bags, config.task, policy, config.mpo.length, rng) if bags else None
+        return ReinforcementLearner(
+            policy, task, config.mpo, rng, fresh=config.initial is None, recorded=recorded, recorded_share=bag_share
+        )
     student = _camera_policy(config).train().to(device)
-    student.mixed_precision = True
-    if config.stage == "mpo":
-        return ReinforcementLearner(student, task, config.mpo, rng, fresh=fresh)
     teacher = _teacher(config.teacher)
-    return DistilLearner(student, task, teacher, config.distil, rng, steps=config.steps, fresh=fresh)
+    return DistilLearner(student, task, teacher, config.distil, rng, steps=config.steps, fresh=config.initial is None)
+
+
+def _policy(config: TrainConfig) -> PrivilegedPolicy | VisuomotorController:
+    if config.stage == "mpo":
+        return _camera_policy(config)
+    return (
+        PrivilegedPolicy(config.task.body) if config.initial is None else load_weights(PrivilegedPolicy, config.initial)
+    )
 
 
 def _camera_policy(config: TrainConfig) -> VisuomotorController:
     if config.initial is not None:
-        return load_weights(VisuomotorController, config.initial)
-    n = config.network
-    return VisuomotorController(config.task.body, n.channels, n.features, n.hidden)
+        policy = load_weights(VisuomotorController, config.initial)
+    else:
+        n = config.network
+        policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden)
+    policy.mixed_precision = True
+    return policy
 
 
 def _teacher(weights: Path | None) -> Driver:
@@ -156,7 +189,10 @@ class TrainingRun:
         self.directory = RunDirectory(options.run, self.config)
         done = self._steps_done()
         self._metrics: dict[str, Any] = {}
-        self.learner = make_learner(self.config, threads=options.threads, device=options.device, stream=done)
+        self.learner = make_learner(
+            self.config, threads=options.threads, device=options.device, stream=done,
+            bags=options.bags, bag_share=options.bag_share,
+        )  # fmt: skip
         learner = self.learner
         snapshot = self.directory.load(modules=learner.modules, optimisers=learner.optimisers)
         if snapshot is not None:
@@ -210,6 +246,7 @@ class TrainingRun:
             "teacher": "scripted driver" if config.teacher is None else digest(config.teacher),
             "initial": None if config.initial is None else digest(config.initial),
             "data": f"generated levels of difficulty {config.task.difficulty}, seeds of TRAIN_SEEDS",
+            "bags": [str(bag) for bag in self.options.bags],
             "steps": learner.frames,
             "updates": learner.updates,
             "metrics": self._metrics,

@@ -1,0 +1,140 @@
+"""Recorded bags give MPO the same transitions as the goal task in which they were recorded."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from bringup.recording import Recorder
+from bringup.rollout import Tick
+from mujoban_controller.bag_sequences import BagSequences, episodes, open_checked, transitions
+from mujoban_controller.controller import Recurrent, VisuomotorController
+from mujoban_controller.goal_features import privileged_features
+from mujoban_controller.goal_task import GoalTask, GoalTaskConfig, judging_config
+from mujoban_controller.mpo import MPOTrainingConfig
+from mujoban_controller.scripted import scripted_driver
+from mujoban_controller.train import NetworkConfig, Options, TrainConfig, TrainingRun
+from mujoban_msgs_py import topics
+from mujoban_msgs_py.bags import BagError, BagWriter
+from mujoban_sim.bodies import BALL
+from mujoban_sim.generator import TRAIN_SEEDS, generate_level
+from mujoban_sim.grid import INSTRUCTION_LIMIT
+from mujoban_sim.interfaces import Observation, TerminationOutput
+from mujoban_sim.oracles import OraclePlanner
+from mujoban_sim.sense_plan_act import Decision
+from mujoban_sim.world import EpisodeSpec
+
+STANDSTILL = INSTRUCTION_LIMIT + 5
+LENGTH = STANDSTILL + 100
+CONFIG = judging_config(1, difficulty=2)
+
+
+def play_and_record(path, seed):
+    """Record an episode of a robot that stands until an instruction fails, then drives; return what the task said."""
+    spec = EpisodeSpec(generate_level(2, seed), seed)
+    task = GoalTask(CONFIG, OraclePlanner(), lambda: spec, np.random.default_rng(0))
+    live, sequence, never = [], 1, np.array([False])
+    with Recorder(path, BALL, [spec], [2]) as recorder:
+        for step in range(LENGTH):
+            inputs = task.observe()
+            torque = scripted_driver(task) * (step > STANDSTILL)
+            failed = bool(live) and live[-1]["discount"] == 0
+            sequence += bool(inputs.terminated[0])
+            live.append({
+                "state": privileged_features(task.world, task.elapsed)[0], "frame": inputs.frame[0],
+                "proprio": inputs.proprio[0], "instruction": int(inputs.instruction[0]),
+                "terminated": bool(inputs.terminated[0]), "action": torque[0],
+            })  # fmt: skip
+            said = TerminationOutput(np.zeros(1, np.float32), inputs.terminated, np.array([failed]))
+            pose = task.world.pose.copy()
+            recorder.write(Tick(
+                np.array([0]), np.array([0]), np.array([step]), Observation(inputs.frame, inputs.proprio, pose),
+                inputs.truth, Decision(
+                    inputs.truth.abstract_state, said, inputs.instruction, np.array([sequence]), inputs.terminated,
+                    torque,
+                ),
+                np.zeros(1, np.float32), np.zeros(1, np.float32), never, np.array([step == LENGTH - 1]),
+            ))  # fmt: skip
+            result = task.step(torque)
+            live[-1] |= {"reward": result.reward[0], "discount": result.discount[0]}
+    return {name: np.stack([tick[name] for tick in live])[:-1] for name in live[0]}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bags")
+    return path, play_and_record(path, TRAIN_SEEDS.start)
+
+
+def test_the_transitions_are_those_of_the_goal_task(recorded):
+    path, live = recorded
+    (ticks,) = episodes(open_checked(path / "row000"))
+    found = transitions(ticks, CONFIG)
+    assert found.keys() - live.keys() == {"first"} and np.flatnonzero(found["first"]).tolist() == [0]
+    assert (live["discount"] == 0).sum() == 1 and (live["reward"] > 3.0).sum() >= 2
+    # The speed of a box is estimated: bags do not hold it.
+    speed = live["state"].shape[1] - 26
+    assert np.corrcoef(found["state"][:, speed], live["state"][:, speed])[0, 1] > 0.9
+    for fields in (found, live):
+        fields["state"] = np.delete(fields["state"], speed, 1)
+    for name in live:
+        np.testing.assert_allclose(found[name], live[name], atol=1e-4, err_msg=name)
+
+
+def test_sequences_cover_an_episode_and_know_the_policys_memory(recorded):
+    path, live = recorded
+    torch.manual_seed(0)
+    policy = VisuomotorController(channels=(4, 8, 8), features=16, hidden=8)
+    stream = BagSequences([path], CONFIG, policy, 50, np.random.default_rng(0))
+    found = [next(stream) for _ in range(-(-(LENGTH - 1) // 50))]
+    assert [int(part["first"].sum()) for part, _ in found] == [1] + [0] * (len(found) - 1)
+    np.testing.assert_array_equal(found[-1][0]["action"][:, 0], live["action"][-50:])
+    inputs = (torch.from_numpy(live[k][None, :50]) for k in ("frame", "proprio", "instruction", "terminated"))
+    with torch.inference_mode():
+        memory = policy(*inputs, Recurrent(*policy.initial_memory(1))).memory
+    for name, values in found[1][1].items():
+        np.testing.assert_allclose(values, memory[int(name[-1])].numpy(), atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("stage", ["teacher", "mpo"])
+def test_a_run_learns_from_bags_as_well(recorded, stage, tmp_path):
+    config = TrainConfig(
+        stage=stage, steps=64, task=GoalTaskConfig(batch=4, difficulty=2),
+        network=NetworkConfig(channels=(4, 8, 8), features=16, hidden=8),
+        mpo=MPOTrainingConfig(length=8, sequences=2, replay=64, reuse=1.0),
+    )  # fmt: skip
+    run = TrainingRun(Options(tmp_path, config, bags=(recorded[0],), bag_share=0.5, evaluation_episodes=0))
+    run.run()
+    assert run.learner.frames == 64
+    assert run.learner.replay.size == 2 * 64 // 8
+    assert run.learner.updates == 8
+
+
+def test_a_missing_topic_is_named_in_one_line(recorded, tmp_path):
+    bag = open_checked(recorded[0] / "row000")
+    kept = [t for t in topics.GRAPH_TOPICS.values() if t.name in bag.topics and t is not topics.TORQUE]
+    with BagWriter(tmp_path / "bag", kept) as writer:
+        for message in bag.messages([t.name for t in kept]):
+            writer.write(message.topic, message.stamp, message.data)
+    command = [
+        sys.executable, "-m", "mujoban_controller.train", "--stage", "mpo", "--run", str(tmp_path / "run"),
+        "--bags", str(tmp_path / "bag"),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "lacks /torque" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_episodes_that_are_kept_for_tests_are_refused(tmp_path):
+    play_and_record(tmp_path, 5)
+    with pytest.raises(BagError, match="seed 5"):
+        next(episodes(open_checked(tmp_path / "row000")))
+
+
+def test_distillation_refuses_bags(recorded, tmp_path):
+    with pytest.raises(ValueError, match="bags lack the labels"):
+        Options(tmp_path, TrainConfig(stage="distil"), bags=(recorded[0],))
