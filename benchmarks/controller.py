@@ -1,8 +1,10 @@
 """How long a step of the controller takes, how fast it trains, and whether continuous MPO solves a known problem.
 
 ``python -m benchmarks.controller`` prints JSON; ``--pendulum-steps 20000`` adds Gymnasium's ``Pendulum-v1`` learned
-from scratch (solved: a mean return above -250). Step times are processor time of one thread, so that other work on
-the machine hardly changes them.
+from scratch (solved: a mean return above -250). ``--random-steps 10000000`` drives robots at random over levels of
+difficulty 5 and looks whether anything explodes or leaves the grid.
+
+Step times are processor time of one thread, so that other work on the machine hardly changes them.
 """
 
 from __future__ import annotations
@@ -19,12 +21,17 @@ import torch
 import tyro
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from tqdm import tqdm
 
 from mujoban_controller.controller import Gaussian, VisuomotorController, gaussian, gaussian_layers
 from mujoban_controller.goal_task import GoalTaskConfig
 from mujoban_controller.train import TrainConfig, make_learner
 from mujoban_rl.mpo_continuous import MPOConfig, MPOLoss, td_target
+from mujoban_rl.training import StopSignal
+from mujoban_sim.generator import generate_level
+from mujoban_sim.grid import GRID_SIZE, xy_to_cell
 from mujoban_sim.interfaces import ControllerInput
+from mujoban_sim.world import EpisodeSpec, World
 
 
 @dataclass(frozen=True)
@@ -36,6 +43,8 @@ class Options:
     """Rounds of collecting and learning to time."""
     pendulum_steps: int = 0
     """Environment steps of MPO on Pendulum-v1."""
+    random_steps: int = 0
+    """Environment steps of random torques, summed over 64 robots."""
     seed: int = 0
 
 
@@ -165,6 +174,72 @@ class PendulumMPO:
             self._target.load_state_dict(self._policy.state_dict())
 
 
+_LOOK_EVERY = 5
+"""Steps between two looks at the world in which robots drive at random."""
+
+
+class RandomDrive:
+    """Robots that are driven at random: half of them hold a torque for a while, half draw one in each step."""
+
+    def __init__(self, seed: int, batch: int = 64, levels: int = 512) -> None:
+        """Play `levels` test levels of difficulty 5 over and over."""
+        self._rng = np.random.default_rng(seed)
+        self._pool = [EpisodeSpec(generate_level(5, seed + i), seed + i) for i in range(levels)]
+        self.world = World(batch)
+        self._torque = np.zeros((batch, self.world.body.action_size), np.float32)
+        self._reset(np.arange(batch))
+        self.report = {"random_steps": 0, "episodes": 0, "not_finite": 0, "robots_outside": 0, "boxes_outside": 0,
+                       "fastest_robot": 0.0, "fastest_box": 0.0}  # fmt: skip
+        self._ticks = 0
+
+    def _reset(self, rows: NDArray[np.int64]) -> None:
+        self.world.reset(rows, [self._pool[i] for i in self._rng.integers(len(self._pool), size=len(rows))])
+
+    def play(self, steps: int) -> dict[str, float]:
+        """Play, until a signal asks to stop; return numbers of looks with something wrong, highest speeds in m/s."""
+        world, rng, report = self.world, self._rng, self.report
+        with StopSignal() as stop, tqdm(total=steps, unit="step") as bar:
+            while report["random_steps"] < steps and not stop.requested:
+                drawn = rng.uniform(-1.0, 1.0, self._torque.shape).astype(np.float32)
+                renewed = rng.random(world.batch) < 0.05
+                renewed[::2] = True
+                self._torque[renewed] = drawn[renewed]
+                world.step(self._torque)
+                self._ticks += 1
+                # What has left the grid or is not finite stays so.
+                if self._ticks % _LOOK_EVERY == 0:
+                    self._check()
+                report["random_steps"] += world.batch
+                bar.update(world.batch)
+                over = np.flatnonzero(world.done)
+                report["episodes"] += len(over)
+                if over.size:
+                    self._reset(over)
+        return report
+
+    def _check(self) -> None:
+        world, report = self.world, self.report
+        rows, size = np.arange(world.batch), world.body.cell_size
+        state = np.concatenate([world.pose, world.velocity, world.proprio], 1)
+        present = np.arange(world.max_boxes) < world.box_count[:, None]
+        boxes = np.where(present[..., None], world.box_position, world.pose[:, None, :2])
+        finite = np.isfinite(state).all(1) & np.isfinite(boxes).all((1, 2))
+        report["not_finite"] += int((~finite).sum())
+        # A cell inside of the walls, whatever the numbers are.
+        robot, box = (np.clip(xy_to_cell(np.nan_to_num(p), size), 0, GRID_SIZE - 1) for p in (world.pose[:, :2], boxes))
+        report["robots_outside"] += int(world.wall[rows, robot[:, 0], robot[:, 1]].sum())
+        report["boxes_outside"] += int((world.wall[rows[:, None], box[..., 0], box[..., 1]] & present).sum())
+        robots, pushed = np.hypot(*world.velocity[:, :2].T).max(), (world.box_speed * present).max()
+        report["fastest_robot"] = max(report["fastest_robot"], float(robots))
+        report["fastest_box"] = max(report["fastest_box"], float(pushed))
+
+
+def run() -> dict[str, object]:
+    """Return the quick measurements: the time of a step, and the speed of training."""
+    torch.set_num_threads(1)
+    return {"controller_step_ms": step_time(200), **training_rates(2)}
+
+
 def main() -> None:
     """Measure and print."""
     options = tyro.cli(Options)
@@ -175,6 +250,8 @@ def main() -> None:
         curve = pendulum.train(options.pendulum_steps)
         final = [pendulum.play(explore=False, seed=seed) for seed in range(10)]
         result |= {"pendulum_curve": curve, "pendulum_return": float(np.mean(final))}
+    if options.random_steps:
+        result |= RandomDrive(options.seed).play(options.random_steps)
     print(json.dumps(result, indent=2))
 
 
