@@ -44,6 +44,8 @@ class Options:
     """Seed of the first generated level; the next ones follow."""
     thinking: int = 1
     """Repeats of the recurrent core (symmetric views of the residual network) per decision, relative to training."""
+    caution: float | None = None
+    """Weight of the verdicts on pushes in a decision; the planner's own by default."""
     look_ahead: bool = False
     """Search under the abstract rules, guided by the network."""
     expansions: int = 400
@@ -79,6 +81,8 @@ class Options:
 def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> dict[str, Any]:
     """Return the figures of a planner on levels."""
     planner.thinking = options.thinking
+    if options.caution is not None:
+        planner.caution = options.caution
     player = LookAheadPlanner(planner, options.expansions) if options.look_ahead else planner
     start = time.perf_counter()
     # In chunks, so that memory stays small whatever the number of levels.
@@ -98,6 +102,7 @@ def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> d
         "decisions_per_second": decisions / elapsed,
         "architecture": type(planner).__name__,
         "thinking": options.thinking,
+        "caution": planner.caution,
         "look_ahead": options.look_ahead,
         "levels": str(options.levels) if options.levels else None,
         "difficulty": None if options.levels else options.difficulty,

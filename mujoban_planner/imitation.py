@@ -30,6 +30,9 @@ from mujoban_rl.weights import provenance, save_weights
 _STOCK_BATCHES = 800
 """Batches of demonstrations kept ahead, and learned from before the planner's own play is worth correcting."""
 
+_ENOUGH = 20_000
+"""Corrections from which on they make up their whole share of a batch."""
+
 
 @dataclass(frozen=True)
 class ImitationConfig(NetworkConfig):
@@ -142,6 +145,7 @@ class ImitationTrainer:
         self.metrics: dict[str, float] = {}
         """Of the last evaluation."""
         self._restore()
+        self._resumed_at = self.samples
         self.demonstrations = SampleBuffer(config.buffer)
         self.corrections = SampleBuffer(config.buffer)
         self.played_weights = self.directory.path / "played.safetensors"
@@ -150,7 +154,7 @@ class ImitationTrainer:
         stream = 1000 * config.seed + self.bits
         mix = difficulty_shares(config.mix)
         if processes:
-            self._process = LessonProcess(stream, mix, config.judged, self.played_weights, niceness=5)
+            self._process = LessonProcess(stream, mix, config.judged, self.played_weights, niceness=1)
         else:
             self._maker = LessonMaker(stream, mix, config.judged)
 
@@ -240,9 +244,10 @@ class ImitationTrainer:
         """Fetch lessons where the buffers lag behind what was consumed."""
         config = self.config
         first = self.demonstrations.size == 0
+        learned = self.samples - self._resumed_at
         stock = _STOCK_BATCHES * config.batch_size
-        fresh_wanted = self.demonstrations.added < stock + config.freshness * self.samples
-        played_wanted = self.samples > stock and self.corrections.added < config.freshness * self.samples
+        fresh_wanted = self.demonstrations.added < stock + config.freshness * learned
+        played_wanted = self.samples > stock and self.corrections.added < _ENOUGH + config.freshness * learned
         if self._maker is not None:
             if fresh_wanted:
                 self.demonstrations.add(self._maker.demonstrations())
@@ -258,7 +263,8 @@ class ImitationTrainer:
 
     def _step(self, guard: NaNGuard, sums: dict[str, float]) -> None:
         config = self.config
-        corrections = int(config.batch_size * config.corrections) if self.corrections.size else 0
+        # A few corrections must not be learned by heart.
+        corrections = int(config.batch_size * config.corrections * min(1.0, self.corrections.size / _ENOUGH))
         parts = [self.demonstrations.draw(config.batch_size - corrections, self.rng)]
         if corrections:
             parts.append(self.corrections.draw(corrections, self.rng))

@@ -32,6 +32,10 @@ from mujoban_sim.solver import Status
 _WALK_SHARE: Final = 0.35
 """Share of walking states that is kept; pushes decide a level."""
 _PLAY_LIMIT: Final = 90
+_VISITS: Final = 4
+"""States of each game from which the way is shown."""
+_KEPT: Final = 5
+"""States kept of each such way."""
 _SEEDS_PER_STREAM: Final = 10**12
 
 
@@ -105,8 +109,9 @@ class LessonMaker:
             parts.append(self._teacher.demonstrate(_states(levels, game, rows, later), self._rng))
         # Anywhere on its way: what it sees that demonstrations do not visit.
         alive_until = np.where(lost, np.maximum(first_dead - 1, 1), length)
-        somewhere = _states(levels, game, batch, self._rng.integers(0, alive_until))
-        parts.append(self._teacher.demonstrate(somewhere, self._rng, judged=self._judged, keep=6))
+        for _ in range(_VISITS):
+            somewhere = _states(levels, game, batch, self._rng.integers(0, alive_until))
+            parts.append(self._teacher.demonstrate(somewhere, self._rng, judged=self._judged, keep=_KEPT))
         return parts
 
     def _first_dead(self, levels: LevelBatch, game: Game) -> NDArray[np.int64]:

@@ -64,7 +64,7 @@ class LearnedPlanner(nn.Module, Planner):
         self.thinking = 1
         """Thinking time: repeats of the recurrent core, or symmetric views, per decision; 1 is as trained."""
         self.caution = 1.0
-        """Weight of the dead-state head in a decision."""
+        """Weight of the verdicts on pushes and instructions in a decision; 1 is as trained."""
 
     @property
     @abstractmethod
@@ -86,7 +86,7 @@ class LearnedPlanner(nn.Module, Planner):
         spread = propagate(planes) if self.propagation else None
         inputs = planes if spread is None else torch.cat([planes, spread], 1)
         features = self.features(inputs.contiguous(memory_format=torch.channels_last))
-        return self.heads(features, planes, None if spread is None else spread[:, 0])
+        return self.heads(features, planes, None if spread is None else spread[:, 0], self.caution)
 
     @property
     def inputs(self) -> int:
@@ -166,13 +166,16 @@ class PlannerHeads(nn.Module):
             nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, INSTRUCTIONS - 1, 1)
         ) if judge and propagation else None
 
-    def forward(self, features: Tensor, planes: Tensor, reachable: Tensor | None) -> PlannerOutput:
+    def forward(
+        self, features: Tensor, planes: Tensor, reachable: Tensor | None, caution: float = 1.0
+    ) -> PlannerOutput:
         """Return the outputs.
 
         Args:
             features: [B, C, I, I].
             planes: (floor, target, agent, box), [B, 4, I, I].
             reachable: Where the robot can walk, [B, I, I]; None without propagation.
+            caution: Weight of log(1 - p(dead)) beside the log-probability of a push.
         """
         features = functional.relu(features)
         here = (features * planes[:, AGENT : AGENT + 1]).sum((2, 3))  # Shape [B, C]
@@ -186,7 +189,7 @@ class PlannerHeads(nn.Module):
         wanted = push.detach()
         if self.push_dead is not None:
             push_dead = self.push_dead(features).float()
-            wanted = wanted + functional.logsigmoid(-push_dead.detach())
+            wanted = wanted + caution * functional.logsigmoid(-push_dead.detach())
             wanted = wanted - wanted.amax((1, 2, 3), keepdim=True)
         if self.walk is not None:
             towards, start = walk_to_push(wanted.exp(), planes)

@@ -84,11 +84,14 @@ def search(planner: LearnedPlanner, starts: BitBoards, *, expansions: int, limit
 
 @torch.inference_mode()
 def _evaluate(planner: LearnedPlanner, boards: BitBoards) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return log-probabilities of pushes, [M, 4, I * I], and log p(alive), [M]."""
+    """Return how promising pushes are, as log-probabilities, [M, 4, I * I], and log p(alive), [M]."""
     device = next(planner.parameters()).device
     output = planner(state_tensor(boards).to(device))
     alive = functional.logsigmoid(-output.dead[:, Instruction.STAY])
-    return output.push.flatten(2).double().cpu().numpy(), alive.double().cpu().numpy()
+    push = output.push
+    if output.push_dead is not None:
+        push = push + functional.logsigmoid(-output.push_dead)
+    return push.flatten(2).double().cpu().numpy(), alive.double().cpu().numpy()
 
 
 class _Tree:
