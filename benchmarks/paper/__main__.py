@@ -2,39 +2,97 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.paper import figures, tables
-from benchmarks.paper.runs import CONFIGURATIONS, DIFFICULTY, RESULTS, SEED
+from benchmarks.paper import curves, figures, film, tables
+from benchmarks.paper.runs import CONFIGURATIONS, DIFFICULTY, RESULTS, SEED, ResultError, Run, is_stale
+from mujoban_sim.rendering import RenderingError
 
 INTRODUCTION = f"""# Results
 
-Rebuilt by `make results` from the JSON in `json/`, which `python -m benchmarks.paper.runs` writes by running
-`bringup/evaluate.py` on n levels of the generator with seeds from {SEED} on, never used in training (paper: n = 512).
-Intervals are 95 % Wilson intervals of the success rate. A row marked † was measured with other weights than those
-that ship now.
+`make results` rebuilds this page and its figures from the files in `json/`, in seconds. What lies there was measured by
+
+    python -m benchmarks.paper.runs                    # everything: hours on two cores; goes on where it was ended
+    python -m benchmarks.paper.runs --only NAME        # one row, by the name in its table, or film_strip
+    python -m benchmarks.paper.curves --help           # learning curves from the run directories of trainers
+
+Rows run `bringup/evaluate.py` on n levels of the generator with the seeds {SEED} to {SEED} + n - 1, never used in
+training (paper: n = 512). Intervals are 95 % Wilson intervals of the success rate, s.e. is the standard error. A row
+marked † was measured with other weights than those that ship now; the JSON has the digests of its weights, and every
+episode.
+"""
+TABLE_2 = """Each configuration replaces modules by oracles.
 """
 
 
-def main(folder: Path = RESULTS) -> None:
-    """Write README.md and the figures."""
+def main(folder: Path = RESULTS) -> int:
+    """Write README.md and the figures; return 1 if a source is damaged."""
     folder.mkdir(parents=True, exist_ok=True)
-    sections = [
-        INTRODUCTION,
-        "## Table 2: module evaluation\n",
-        "The first row is also the modular row of Table 1.\n",
-        tables.configurations(CONFIGURATIONS),
-        "## Why episodes fail\n",
-        tables.failures(CONFIGURATIONS),
-        "## Figure 2: success against difficulty\n",
-        tables.configurations(DIFFICULTY),
-    ]
-    if figures.difficulty(DIFFICULTY, folder / "figure2.png"):
-        sections.append("![Success rate against difficulty](figure2.png)\n")
-    if figures.curves(folder / "figure4.png"):
-        sections += ["## Figure 4: learning curves\n", "![Learning curves of the modules](figure4.png)\n"]
+    try:
+        sections = [
+            INTRODUCTION,
+            "## Table 1: main results, modular row\n",
+            tables.configurations(CONFIGURATIONS[:1]),
+            "## Table 2: module evaluation\n",
+            TABLE_2,
+            tables.configurations(CONFIGURATIONS),
+            "Why episodes fail:\n",
+            tables.failures(CONFIGURATIONS),
+            "## Figure 2: success against difficulty\n",
+            tables.configurations(DIFFICULTY),
+            *_figure_2(DIFFICULTY, folder),
+            "## Figure 3: an episode\n",
+            *_figure_3(folder),
+            "## Figure 4: learning curves\n",
+            *_figure_4(folder),
+        ]
+    except ResultError as error:
+        print(f"results: error: {error}", file=sys.stderr)
+        return 1
     (folder / "README.md").write_text("\n".join(sections))
+    return 0
+
+
+def _figure_2(runs: Sequence[Run], folder: Path) -> list[str]:
+    if figures.difficulty(runs, folder / "figure2.png"):
+        return ["![Success rate against difficulty](figure2.png)\n"]
+    return _missing("Figure 2", "python -m benchmarks.paper.runs")
+
+
+def _figure_3(folder: Path) -> list[str]:
+    episode = film.load()
+    if episode is None:
+        return _missing("Figure 3", film.RERUN)
+    file = folder / "figure3.png"
+    try:
+        film.draw(episode, file)
+    except RenderingError as error:
+        print(f"Figure 3 stays as it was: {error}", file=sys.stderr)
+    text = (
+        f"What the robot sees, above the view from above that it does not see; seed {episode['seed']}, difficulty "
+        f"{episode['difficulty']}, solved in {len(episode['torque'])} steps with {len(episode['instructions'])} "
+        f"instructions. Arrows are the instruction in force.{tables.STALE if is_stale(episode) else ''}\n"
+    )
+    return [text, "![Frames of an episode that was solved](figure3.png)\n"]
+
+
+def _figure_4(folder: Path) -> list[str]:
+    missing = figures.curves(folder / "figure4.png")
+    sections = []
+    if len(missing) < len(curves.MODULES):
+        sections += ["![Learning curves of the modules](figure4.png)\n"]
+    if missing:
+        options = " ".join(f"--{module} RUN" for module in missing)
+        sections += _missing(f"The curve of {', '.join(missing)}", f"python -m benchmarks.paper.curves {options}")
+    return sections
+
+
+def _missing(what: str, command: str) -> list[str]:
+    print(f"{what} has no source yet: {command}", file=sys.stderr)
+    return [f"{what}: not measured yet (`{command}`).\n"]
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

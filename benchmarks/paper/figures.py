@@ -1,11 +1,11 @@
-"""Figures 2 and 4 of the paper, drawn from JSON."""
+"""Figures 2 and 4 of the paper, drawn from JSON; Figure 3 is in `benchmarks.paper.film`."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import matplotlib as mpl
 
@@ -13,15 +13,10 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from benchmarks.paper.runs import JSON, Run, load
+from benchmarks.paper.curves import MODULES
+from benchmarks.paper.runs import JSON, ResultError, Run, is_stale, load
 
-CURVES: Final = {
-    "controller": ("curve_controller.jsonl", "instructions completed"),
-    "planner": ("curve_planner.jsonl", "levels solved"),
-    "estimator": ("curve_estimator.jsonl", "cells right"),
-    "termination": ("curve_termination.jsonl", "F1"),
-}
-"""Module -> its curve, one JSON object a line with `step` and `value`, and what `value` is (paper Fig. 4)."""
+_COLUMNS: Final = 4
 
 
 def difficulty(runs: Sequence[Run], file: Path) -> bool:
@@ -29,12 +24,17 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
     reports = [(run, report) for run in runs if (report := load(run)) is not None]
     if not reports:
         return False
-    x = [run.difficulty for run, _ in reports]
-    y = [report["success_rate"] for _, report in reports]
-    low = [rate - report["success_interval"][0] for rate, (_, report) in zip(y, reports, strict=True)]
-    high = [report["success_interval"][1] - rate for rate, (_, report) in zip(y, reports, strict=True)]
     figure, axes = plt.subplots(figsize=(5, 3.2), layout="constrained")
-    axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, label="Mujoban, fully learned")
+    for stale, label in ((False, "Mujoban, fully learned"), (True, "the same with other weights than ship now")):
+        chosen = [(run, report) for run, report in reports if is_stale(report) == stale]
+        if chosen:
+            x = [run.difficulty for run, _ in chosen]
+            y = [report["success_rate"] for _, report in chosen]
+            low, high = zip(*(_margins(report) for _, report in chosen), strict=True)
+            axes.errorbar(
+                x, y, yerr=[low, high], capsize=3, label=label, marker="o", color="tab:blue",
+                linestyle="none" if stale else "-", markerfacecolor="white" if stale else "tab:blue",
+            )  # fmt: skip
     paper = [(run.difficulty, run.paper_success) for run, _ in reports if run.paper_success is not None]
     if paper:
         axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, Table 1", zorder=3)
@@ -45,16 +45,37 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
     return True
 
 
-def curves(file: Path, folder: Path = JSON) -> bool:
-    """Draw the learning curves of the modules (paper Fig. 4); return False when there is none."""
-    found = {name: (folder / source, label) for name, (source, label) in CURVES.items() if (folder / source).exists()}
-    if not found:
-        return False
-    figure, panels = plt.subplots(1, len(found), figsize=(3.2 * len(found), 2.8), layout="constrained", squeeze=False)
-    for axes, (name, (source, label)) in zip(panels[0], found.items(), strict=True):
+def curves(file: Path, folder: Path = JSON) -> list[str]:
+    """Draw the learning curves of the modules (paper Fig. 4) that there are; return the modules without one.
+
+    Raises:
+        ResultError: If a curve is not what `benchmarks.paper.curves` writes.
+    """
+    sources = {module: folder / f"curve_{module}.jsonl" for module in MODULES}
+    found = {module: _points(source) for module, source in sources.items() if source.exists()}
+    if found:
+        figure, panels = plt.subplots(1, _COLUMNS, figsize=(3.0 * _COLUMNS, 2.7), layout="constrained", squeeze=False)
+        for axes in panels[0][len(found) :]:
+            axes.set_axis_off()
+        for axes, (module, points) in zip(panels[0], found.items(), strict=False):
+            axes.plot([p["step"] / 1e6 for p in points], [p["value"] for p in points], marker=".", markersize=3)
+            axes.set(title=module, xlabel="million samples", ylabel=points[0].get("what", ""))
+            axes.grid(alpha=0.3)
+        figure.savefig(file, dpi=110)
+        plt.close(figure)
+    return [module for module in MODULES if module not in found]
+
+
+def _margins(report: dict[str, Any]) -> tuple[float, float]:
+    low, high = report["success_interval"]
+    return report["success_rate"] - low, high - report["success_rate"]
+
+
+def _points(source: Path) -> list[dict[str, Any]]:
+    try:
         points = [json.loads(line) for line in source.read_text().splitlines()]
-        axes.plot([p["step"] for p in points], [p["value"] for p in points])
-        axes.set(title=name, xlabel="environment steps or samples", ylabel=label)
-    figure.savefig(file, dpi=120)
-    plt.close(figure)
-    return True
+        if points and all({"step", "value"} <= point.keys() for point in points):
+            return points
+    except (json.JSONDecodeError, AttributeError):
+        pass
+    raise ResultError(f"{source}: expected lines of JSON with step and value; rerun python -m benchmarks.paper.curves")

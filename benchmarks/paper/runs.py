@@ -1,13 +1,13 @@
 """The evaluations behind the paper's tables and figures, and where their JSON lies.
 
-`python -m benchmarks.paper.runs` reruns them (hours on two cores); `--only NAME` reruns one. Rebuilding the
-tables from the JSON takes seconds: `make results`.
+`python -m benchmarks.paper.runs` reruns them (hours on two cores), `--only NAME` one of them. It can be ended at any
+time: the same command goes on where it stopped, and leaves out what has been measured with the weights that ship.
+Rebuilding tables and figures from the JSON takes seconds: `make results`.
 """
 
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +15,22 @@ from typing import Any, Final
 
 import tyro
 
+from mujoban_rl.weights import digest
+from mujoban_sim.plugins import ROLES, shipped_weights
+
 ROOT: Final = Path(__file__).resolve().parents[2]
 RESULTS: Final = ROOT / "docs" / "results"
 JSON: Final = RESULTS / "json"
 SEED: Final = 1000
 """Seed of the first of the 512 unseen levels (paper C.5); a test seed, like all that a user types."""
+EPISODES: Final = 512
+"""Levels of an evaluation (paper C.5)."""
+DIGEST_LENGTH: Final = 64
+"""Characters of a digest of weights; what is shorter names a class that stands in."""
 
 
 class ResultError(ValueError):
-    """The JSON of an evaluation is missing or not what `evaluate.py` writes."""
+    """A source of a table or figure is missing or not what its command writes."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +50,15 @@ class Run:
         """Where the evaluation's JSON lies."""
         return JSON / f"{self.name}.json"
 
-    def command(self, episodes: int) -> list[str]:
-        """Return the command that runs the evaluation, relative to the repository."""
+    @property
+    def rerun(self) -> str:
+        """The command that reruns the evaluation."""
+        return f"python -m benchmarks.paper.runs --only {self.name}"
+
+    def options(self) -> list[str]:
+        """Return the options of `bringup/evaluate.py` but for levels, seed and report."""
         oracle = ["--oracle", ",".join(self.oracle)] if self.oracle else []
-        return [
-            *("bringup/evaluate.py", "--difficulty", str(self.difficulty), "--episodes", str(episodes)),
-            *("--seed", str(SEED), *oracle, "--json", str(self.file.relative_to(ROOT))),
-        ]
+        return ["--difficulty", str(self.difficulty), *oracle]
 
 
 SENSE: Final = ("estimator", "termination")
@@ -71,32 +80,91 @@ def load(run: Run) -> dict[str, Any] | None:
     """Return the evaluation's JSON, or None when it has not been run.
 
     Raises:
-        ResultError: If the file lacks a key.
+        ResultError: If the file is no JSON or lacks a key.
     """
     if not run.file.exists():
         return None
-    content = json.loads(run.file.read_text())
-    missing = {"success_rate", "success_interval", "mean_return", "episodes", "weights"} - content.keys()
+    return read_source(
+        run.file, ("success_rate", "success_interval", "mean_return", "failures", "episodes", "weights"), run.rerun
+    )
+
+
+def read_source(file: Path, keys: tuple[str, ...], rerun: str) -> dict[str, Any]:
+    """Return a JSON object that has the given keys.
+
+    Raises:
+        ResultError: If it is no such object; `rerun` is the command that writes a new one.
+    """
+    try:
+        content = json.loads(file.read_text())
+    except json.JSONDecodeError as error:
+        raise ResultError(f"{file}: no JSON ({error}); rerun {rerun}") from error
+    missing = set(keys) - content.keys() if isinstance(content, dict) else set(keys)
     if missing:
-        raise ResultError(f"{run.file}: lacks {', '.join(sorted(missing))}; rerun {' '.join(run.command(512))}")
+        raise ResultError(f"{file}: lacks {', '.join(sorted(missing))}; rerun {rerun}")
     return content
 
 
-def main(episodes: int = 512, only: tuple[str, ...] = ()) -> None:
-    """Rerun the evaluations.
+def is_stale(report: dict[str, Any]) -> bool:
+    """Tell whether a module of the evaluation had other weights than those that ship now."""
+    return any(
+        len(identity) == DIGEST_LENGTH and identity != digest(shipped_weights(role))
+        for role, identity in report["weights"].items()
+        if role in ROLES
+    )
 
-    Args:
-        episodes: Levels per evaluation (paper C.5: 512).
-        only: Names of the evaluations to rerun; all of them by default.
-    """
-    unknown = set(only) - {run.name for run in ALL}
+
+def is_current(run: Run, episodes: int) -> bool:
+    """Tell whether the evaluation's JSON has so many levels and comes from the weights that ship now."""
+    try:
+        report = load(run)
+    except ResultError:
+        return False
+    return report is not None and len(report["episodes"]) == episodes and not is_stale(report)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Rerun the evaluations behind tables and figures."""
+
+    only: tuple[str, ...] = ()
+    """Names of the evaluations to rerun; all of them by default. `film_strip` is the episode of Figure 3."""
+    episodes: int = EPISODES
+    """Levels of an evaluation (paper C.5: 512)."""
+    processes: int = 2
+    """Evaluations of different levels that run at the same time."""
+    part: int = 32
+    """Levels that one process plays together; what is measured is kept when such a part has ended."""
+    again: bool = False
+    """Rerun also what has been measured with the weights that ship now."""
+
+
+def main(options: Options) -> None:
+    """Rerun the evaluations."""
+    # Imported here: both need the definitions above.
+    from benchmarks.paper import film, parts
+
+    names = [*(run.name for run in ALL), film.NAME]
+    unknown = set(options.only) - set(names)
     if unknown:
-        sys.exit(f"unknown evaluation {', '.join(sorted(unknown))}: expected some of {', '.join(r.name for r in ALL)}")
+        sys.exit(f"unknown evaluation {', '.join(sorted(unknown))}: expected some of {', '.join(names)}")
     JSON.mkdir(parents=True, exist_ok=True)
+    chosen = options.only or tuple(names)
     for run in ALL:
-        if not only or run.name in only:
-            subprocess.run([sys.executable, *run.command(episodes)], check=True, cwd=ROOT)
+        if run.name not in chosen:
+            continue
+        if is_current(run, options.episodes) and not options.again:
+            print(f"{run.name}: measured already with these weights (--again measures anew)", flush=True)
+            continue
+        parts.evaluate(run, options)
+    if film.NAME in chosen:
+        film.record()
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    try:
+        main(tyro.cli(Options, prog="benchmarks.paper.runs"))
+    except (ValueError, OSError) as failure:
+        sys.exit(f"runs: error: {' '.join(str(failure).split())}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the same command goes on from here")

@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.paper.runs import Run, load
-from mujoban_rl.weights import digest
-from mujoban_sim.plugins import ROLES, shipped_weights
+from benchmarks.paper.runs import Run, is_stale, load
 
 STALE = " †"
 """Marks a result of other weights than those that ship now."""
@@ -18,7 +16,7 @@ MISSING = "-"
 
 def configurations(runs: Sequence[Run]) -> str:
     """Return a table of success rates and rewards, ours beside the paper's."""
-    header = ["configuration", "oracles", "n", "success", "95 % interval", "paper", "reward (s.e.)", "paper"]
+    header = ["configuration", "name", "oracles", "n", "success", "95 % interval", "paper", "reward (s.e.)", "paper"]
     return _table(header, [_row(run, load(run)) for run in runs])
 
 
@@ -34,26 +32,18 @@ def failures(runs: Sequence[Run]) -> str:
     return _table(["configuration", *reasons], rows)
 
 
-def is_stale(report: dict[str, Any]) -> bool:
-    """Tell whether a module of the evaluation had other weights than those that ship now."""
-    return any(
-        len(identity) == 64 and identity != digest(shipped_weights(role))
-        for role, identity in report["weights"].items()
-        if role in ROLES
-    )
-
-
 def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
-    oracles = ", ".join(run.oracle) or "none"
+    name, oracles = f"`{run.name}`", ", ".join(run.oracle) or "none"
     paper = [MISSING if run.paper_success is None else f"{100 * run.paper_success:.1f} %"]
     paper.append(MISSING if run.paper_reward is None else f"{run.paper_reward:.2f}")
     if report is None:
-        return [run.title, oracles, "0", "not measured", MISSING, paper[0], MISSING, paper[1]]
+        return [run.title, name, oracles, "0", "not measured", MISSING, paper[0], MISSING, paper[1]]
     returns = np.array([episode["return"] for episode in report["episodes"]])
     error = returns.std(ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else float("nan")
     low, high = report["success_interval"]
     return [
         run.title + (STALE if is_stale(report) else ""),
+        name,
         oracles,
         str(len(returns)),
         f"{100 * report['success_rate']:.1f} %",

@@ -1,0 +1,127 @@
+"""Figure 4: learning curves of the modules, from the `metrics.jsonl` that trainers write in their run directories.
+
+    python -m benchmarks.paper.curves --planner runs/planner --estimator runs/estimator --controller runs/a runs/b
+
+writes one `curve_<module>.jsonl` for each module named, an object a line with `step`, `value` and `what` the value is.
+Several runs of a module are joined in the order given, as when a run starts from the weights of another.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import tyro
+
+from benchmarks.paper.runs import JSON, ResultError
+from mujoban_rl.weights import write_atomically
+
+MODULES: Final = ("controller", "planner", "estimator", "termination")
+_FEWEST: Final = 3
+"""Points that make a curve; a measure with fewer gives way to the next."""
+_MOST: Final = 200
+"""Points of a curve; more are averaged."""
+
+
+class Measure(NamedTuple):
+    """Something that is drawn of a run."""
+
+    keys: tuple[str, ...]
+    """Entries of a line of the metrics; several are averaged by their counts, `<key>_n`."""
+    what: str
+
+
+MEASURES: Final = {
+    "controller": (Measure(("instruction/move", "instruction/push"), "instructions completed"),),
+    "planner": (Measure(("solve_rate/5",), "levels solved"), Measure(("train/accuracy",), "decisions right")),
+    "estimator": (
+        Measure(("valid/box_recall_in_view",), "boxes in view found"),
+        Measure(("train/box",), "loss of the box layer"),
+    ),
+    "termination": (
+        Measure(("valid/termination_precision",), "terminations in time"),
+        Measure(("train/beta",), "loss of beta"),
+    ),
+}
+"""What is drawn of each module: success or accuracy as in the paper, and the next one where a run has too few of it."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run directories of each module."""
+
+    controller: tuple[Path, ...] = ()
+    planner: tuple[Path, ...] = ()
+    estimator: tuple[Path, ...] = ()
+    """Estimator and termination are trained together: name the run for both."""
+    termination: tuple[Path, ...] = ()
+    out: Path = JSON
+
+
+def read_curve(module: str, runs: Sequence[Path]) -> list[dict[str, Any]]:
+    """Return the points of a module's curve over one or more runs.
+
+    Raises:
+        ResultError: If a run has no metrics, or nothing of what is drawn.
+    """
+    lines: list[tuple[float, dict[str, Any]]] = []
+    offset = 0.0
+    for run in runs:
+        try:
+            metrics = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        except (OSError, json.JSONDecodeError) as error:
+            raise ResultError(f"{run}: expected the run directory of a trainer ({error})") from error
+        scale = _samples_per_step(run)
+        lines += [(offset + scale * line["step"], line) for line in metrics]
+        offset = lines[-1][0] if lines else offset
+    for measure in MEASURES[module]:
+        points = [(step, value) for step, line in lines if (value := _value(line, measure)) is not None]
+        if len(points) >= _FEWEST:
+            return [{"step": round(step), "value": value, "what": measure.what} for step, value in _thin(points)]
+    wanted = ", ".join(key for measure in MEASURES[module] for key in measure.keys)
+    raise ResultError(f"{', '.join(map(str, runs))}: fewer than {_FEWEST} points of {wanted}")
+
+
+def _value(line: dict[str, Any], measure: Measure) -> float | None:
+    """Return the measure's value in a line of the metrics, or None if it has none."""
+    present = [(line[key], line.get(f"{key}_n", 1.0)) for key in measure.keys if line.get(key) is not None]
+    total = sum(count for _, count in present)
+    return sum(value * count for value, count in present) / total if total else None
+
+
+def _samples_per_step(run: Path) -> float:
+    """Return how many samples a step of the run takes; where steps are samples already, 1."""
+    try:
+        config = json.loads((run / "config.json").read_text())
+        return config["streams"] * config["length"]
+    except (OSError, KeyError, json.JSONDecodeError):
+        return 1.0
+
+
+def _thin(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return at most `_MOST` points, each the mean of those in its stretch."""
+    stretches = np.array_split(np.array(points), min(len(points), _MOST))
+    return [(float(part[-1, 0]), round(float(part[:, 1].mean()), 5)) for part in stretches]
+
+
+def main(options: Options) -> None:
+    """Write the curves of the modules whose runs are named."""
+    for module in MODULES:
+        runs: tuple[Path, ...] = getattr(options, module)
+        if runs:
+            points = read_curve(module, runs)
+            text = "".join(json.dumps(point) + "\n" for point in points)
+            write_atomically(options.out / f"curve_{module}.jsonl", text.encode())
+            print(f"{module}: {len(points)} points of {points[0]['what']!r}")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options, prog="benchmarks.paper.curves"))
+    except (ValueError, OSError) as failure:
+        sys.exit(f"curves: error: {' '.join(str(failure).split())}")

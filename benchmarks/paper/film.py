@@ -1,0 +1,119 @@
+"""Figure 3: an episode that the learned modules solved, as a film strip (paper Fig. 3).
+
+`record` plays unseen levels until one is solved and keeps the episode as JSON: its seed, the torques, the instructions
+and the digests of the weights. Physics is deterministic, so `draw` plays the torques again, without any network, and
+draws frames where it likes.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from numpy.typing import NDArray
+
+mpl.use("Agg")
+
+import matplotlib.pyplot as plt
+
+from benchmarks.paper.runs import JSON, SEED, ResultError, read_source
+from bringup.command import Choice, Stack
+from bringup.rollout import ticks
+from mujoban_rl.weights import write_atomically
+from mujoban_sim.episodes import Episodes
+from mujoban_sim.grid import CONTROL_PERIOD, Instruction
+from mujoban_sim.plugins import LEARNED, ROLES
+from mujoban_sim.world import World
+
+NAME: Final = "film_strip"
+RERUN: Final = f"python -m benchmarks.paper.runs --only {NAME}"
+DIFFICULTY: Final = 5
+_CANDIDATES: Final = 8
+"""Levels that are played side by side; the one that is solved first is kept."""
+_COLUMNS: Final = 8
+_TOP_SIZE: Final = 256
+"""Pixels along the edge of a frame from above."""
+_ARROWS: Final = dict(zip(Instruction, "•↑→↓←", strict=True))
+
+
+def record(file: Path = JSON / f"{NAME}.json", seed: int = SEED, difficulty: int = DIFFICULTY) -> None:
+    """Play the levels from a seed on with the learned modules and write the first episode that is solved.
+
+    Raises:
+        ResultError: If none of them is solved.
+    """
+    stack = Stack({role: Choice(role, LEARNED) for role in ROLES})
+    episodes = Episodes(_CANDIDATES, seed, difficulty=difficulty)
+    torque: list[list[NDArray[np.float32]]] = [[] for _ in episodes]
+    instructions: list[list[tuple[int, int]]] = [[] for _ in episodes]
+    world = World(len(episodes), max_boxes=episodes.max_boxes)
+    for tick in ticks(stack.policy(), world, episodes):
+        for m, index in enumerate(tick.episode.tolist()):
+            torque[index].append(tick.decision.torque[m].copy())
+            if tick.decision.issued[m]:
+                instructions[index].append((int(tick.step[m]), int(tick.decision.instruction[m])))
+        solved = tick.episode[tick.solved]
+        if solved.size:
+            first = int(solved[0])
+            break
+    else:
+        raise ResultError(f"none of {len(episodes)} levels from seed {seed} on was solved: no film strip")
+    content = {
+        "seed": seed + first,
+        "difficulty": difficulty,
+        "weights": stack.identities(),
+        "instructions": instructions[first],
+        # The shortest decimals that give the same float32 again.
+        "torque": [[float(str(value)) for value in values] for values in torque[first]],
+    }
+    write_atomically(file, (json.dumps(content) + "\n").encode())
+    print(f"{NAME}: solved the level of seed {seed + first} in {len(torque[first])} steps", flush=True)
+
+
+def load(file: Path = JSON / f"{NAME}.json") -> dict[str, Any] | None:
+    """Return the recorded episode, or None if there is none.
+
+    Raises:
+        ResultError: If the file is not what `record` writes.
+    """
+    if not file.exists():
+        return None
+    return read_source(file, ("seed", "difficulty", "weights", "instructions", "torque"), RERUN)
+
+
+def draw(episode: dict[str, Any], file: Path) -> None:
+    """Play the episode again and draw first-person frames above frames from above.
+
+    Raises:
+        ResultError: If the level is not solved at its end: the world has changed since.
+        RenderingError: If there is no OpenGL.
+    """
+    torque = np.array(episode["torque"], np.float32)
+    moments = np.linspace(0, len(torque), _COLUMNS).round().astype(int)
+    levels = Episodes(1, episode["seed"], difficulty=episode["difficulty"])
+    world = World(1, max_boxes=levels.max_boxes)
+    world.reset([0], [levels[0]])
+    figure, axes = plt.subplots(2, _COLUMNS, figsize=(1.5 * _COLUMNS, 3.4), layout="constrained")
+    for step in range(len(torque) + 1):
+        if step in moments:
+            column = int(np.flatnonzero(moments == step)[0])
+            axes[0, column].imshow(world.render()[0], interpolation="nearest")
+            axes[1, column].imshow(world.render("top_down", size=_TOP_SIZE)[0])
+            axes[0, column].set_title(f"{step * CONTROL_PERIOD:.1f} s {_arrow(episode['instructions'], step)}")
+        if step < len(torque):
+            world.step(torque[step][None])
+    for panel in axes.flat:
+        panel.set_axis_off()
+    if not world.solved[0]:
+        plt.close(figure)
+        raise ResultError(f"the world has changed since the film strip's episode was recorded; rerun {RERUN}")
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def _arrow(instructions: list[tuple[int, int]], step: int) -> str:
+    """Return the sign of the instruction in force at a step."""
+    return _ARROWS[Instruction(max((begin, direction) for begin, direction in instructions if begin <= step)[1])]
