@@ -306,18 +306,24 @@ class RecurrentPlanner(LearnedPlanner):
     """
 
     def __init__(
-        self, channels: int = 32, depth: int = 3, repeats: int = 3, propagation: bool = False
+        self,
+        channels: int = 32,
+        depth: int = 3,
+        repeats: int = 3,
+        propagation: bool = False,
+        judge: bool = False,
     ) -> None:
         """Build DRC(depth, repeats) with `channels` channels."""
         super().__init__(propagation=propagation)
-        self._config = {"channels": channels, "depth": depth, "repeats": repeats, "propagation": propagation}
+        self._config = {"channels": channels, "depth": depth, "repeats": repeats}
+        self._config |= {"propagation": propagation, "judge": judge}
         self.repeats = repeats
         self.encoder = nn.Sequential(
             nn.Conv2d(self.inputs, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, channels, 3, padding=1)
         )
         self.cells = nn.ModuleList([ConvLSTMCell(channels) for _ in range(depth)])
         self.initial = nn.Parameter(torch.zeros(depth, 2, channels, INTERIOR, INTERIOR))
-        self.readout = PlannerHeads(channels, propagation=propagation, judge=False)
+        self.readout = PlannerHeads(channels, propagation=propagation, judge=judge)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -42,12 +42,12 @@ class NetworkConfig:
     """Spread over the board by the rules where the robot can walk and boxes be pushed; the paper's network does not."""
 
     judge: bool = True
-    """Judge each push where the box is (residual, with propagation)."""
+    """Judge each push where the box is (with propagation)."""
 
     def build(self) -> LearnedPlanner:
         """Return a new network."""
         if self.architecture == "recurrent":
-            return RecurrentPlanner(self.channels, self.depth, self.repeats, self.propagation)
+            return RecurrentPlanner(self.channels, self.depth, self.repeats, self.propagation, self.judge)
         return ResidualPlanner(self.channels, self.blocks, self.propagation, self.judge)
 
 
