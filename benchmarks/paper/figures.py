@@ -13,8 +13,9 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
+from benchmarks.paper import runs as sources
 from benchmarks.paper.curves import MODULES
-from benchmarks.paper.runs import JSON, ResultError, Run, is_stale, load
+from benchmarks.paper.runs import ResultError, Run, is_stale, load
 
 _COLUMNS: Final = 4
 
@@ -45,14 +46,14 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
     return True
 
 
-def curves(file: Path, folder: Path = JSON) -> list[str]:
+def curves(file: Path) -> list[str]:
     """Draw the learning curves of the modules (paper Fig. 4) that there are; return the modules without one.
 
     Raises:
         ResultError: If a curve is not what `benchmarks.paper.curves` writes.
     """
-    sources = {module: folder / f"curve_{module}.jsonl" for module in MODULES}
-    found = {module: _points(source) for module, source in sources.items() if source.exists()}
+    files = {module: sources.JSON / f"curve_{module}.jsonl" for module in MODULES}
+    found = {module: _points(source) for module, source in files.items() if source.exists()}
     if found:
         figure, panels = plt.subplots(1, _COLUMNS, figsize=(3.0 * _COLUMNS, 2.7), layout="constrained", squeeze=False)
         for axes in panels[0][len(found) :]:

@@ -19,7 +19,8 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from benchmarks.paper.runs import JSON, SEED, ResultError, read_source
+from benchmarks.paper import runs
+from benchmarks.paper.runs import SEED, ResultError, read_source
 from bringup.command import Choice, Stack
 from bringup.rollout import ticks
 from mujoban_rl.weights import write_atomically
@@ -39,13 +40,18 @@ _TOP_SIZE: Final = 256
 _ARROWS: Final = dict(zip(Instruction, "•↑→↓←", strict=True))
 
 
-def record(file: Path = JSON / f"{NAME}.json", seed: int = SEED, difficulty: int = DIFFICULTY) -> None:
-    """Play the levels from a seed on with the learned modules and write the first episode that is solved.
+def source() -> Path:
+    """Return where the episode lies."""
+    return runs.JSON / f"{NAME}.json"
+
+
+def record(seed: int = SEED, difficulty: int = DIFFICULTY, stack: Stack | None = None) -> None:
+    """Play levels, by default with the learned modules, and write the first episode that is solved.
 
     Raises:
         ResultError: If none of them is solved.
     """
-    stack = Stack({role: Choice(role, LEARNED) for role in ROLES})
+    stack = stack or Stack({role: Choice(role, LEARNED) for role in ROLES})
     episodes = Episodes(_CANDIDATES, seed, difficulty=difficulty)
     torque: list[list[NDArray[np.float32]]] = [[] for _ in episodes]
     instructions: list[list[tuple[int, int]]] = [[] for _ in episodes]
@@ -69,19 +75,19 @@ def record(file: Path = JSON / f"{NAME}.json", seed: int = SEED, difficulty: int
         # The shortest decimals that give the same float32 again.
         "torque": [[float(str(value)) for value in values] for values in torque[first]],
     }
-    write_atomically(file, (json.dumps(content) + "\n").encode())
+    write_atomically(source(), (json.dumps(content) + "\n").encode())
     print(f"{NAME}: solved the level of seed {seed + first} in {len(torque[first])} steps", flush=True)
 
 
-def load(file: Path = JSON / f"{NAME}.json") -> dict[str, Any] | None:
+def load() -> dict[str, Any] | None:
     """Return the recorded episode, or None if there is none.
 
     Raises:
         ResultError: If the file is not what `record` writes.
     """
-    if not file.exists():
+    if not source().exists():
         return None
-    return read_source(file, ("seed", "difficulty", "weights", "instructions", "torque"), RERUN)
+    return read_source(source(), ("seed", "difficulty", "weights", "instructions", "torque"), RERUN)
 
 
 def draw(episode: dict[str, Any], file: Path) -> None:

@@ -1,0 +1,96 @@
+"""Tables and figures of the paper: rebuilt from JSON, marked when stale, missing sources named with their command."""
+
+import json
+
+import pytest
+
+from benchmarks.paper import __main__ as results
+from benchmarks.paper import curves, film, parts, runs, tables
+from bringup.command import Choice, Stack
+from bringup.results import EpisodeResult, report, write_report
+from mujoban_rl.weights import digest
+from mujoban_sim.plugins import ROLES, shipped_weights
+
+ORACLES = Stack({role: Choice(role, "oracle") for role in ROLES})
+EASY = runs.Run("easy", "easy", difficulty=1, oracle=tuple(ROLES))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "JSON", tmp_path / "json")
+    monkeypatch.setattr(parts, "PARTS", tmp_path / "parts")
+    (tmp_path / "json").mkdir()
+    return tmp_path
+
+
+def write(run, solved, of, weights):
+    episodes = [EpisodeResult(i, i < solved, 14.0 if i < solved else 3.0, 100, 9, 0, 0, None) for i in range(of)]
+    write_report(report(episodes, weights), run.file)
+
+
+def test_without_sources_the_page_names_the_commands_that_make_them(folder, capsys):
+    assert results.main(folder) == 0
+    page = (folder / "README.md").read_text()
+    assert "python -m benchmarks.paper.runs --only film_strip" in page
+    assert "python -m benchmarks.paper.curves --controller RUN" in page
+    assert page.count("not measured |") == 9, "one row of Table 1, three of Table 2, five of Figure 2"
+    assert "no source yet" in capsys.readouterr().err
+
+
+def test_the_page_has_our_numbers_beside_the_papers_and_marks_other_weights(folder):
+    shipped = {role: digest(shipped_weights(role)) for role in ROLES}
+    write(runs.CONFIGURATIONS[0], 3, 4, shipped)
+    write(runs.CONFIGURATIONS[2], 4, 4, {**shipped, "controller": "0" * 64})
+    assert results.main(folder) == 0
+    page = (folder / "README.md").read_text()
+    assert "| default | `default` | none | 4 | 75.0 % | 30.1 to 95.4 % | 78.7 % | 11.25 (2.75) | 11.42 |" in page
+    assert f"| controller only{tables.STALE} | `controller` |" in page and (folder / "figure2.png").stat().st_size
+    assert runs.is_current(runs.CONFIGURATIONS[0], 4) and not runs.is_current(runs.CONFIGURATIONS[0], 512)
+    assert not runs.is_current(runs.CONFIGURATIONS[2], 4)
+
+
+def test_a_damaged_source_is_one_line_with_the_command_that_mends_it(folder, capsys):
+    runs.CONFIGURATIONS[0].file.write_text("{}")
+    assert results.main(folder) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "default.json" in line and "python -m benchmarks.paper.runs --only default" in line
+
+
+def test_the_film_strip_plays_the_recorded_episode_again(folder):
+    film.record(seed=1000, difficulty=1, stack=ORACLES)
+    episode = film.load()
+    film.draw(episode, folder / "strip.png")
+    assert (folder / "strip.png").stat().st_size > 10_000
+    episode["torque"] = episode["torque"][: len(episode["torque"]) // 2]
+    with pytest.raises(runs.ResultError, match="the world has changed"):
+        film.draw(episode, folder / "strip.png")
+
+
+@pytest.mark.timeout(300)
+def test_an_evaluation_goes_on_where_it_was_ended_and_gives_what_one_run_gives(folder, monkeypatch, capfd):
+    options = runs.Options(episodes=3, part=2)
+    # The weights are "oracle": nothing that could be stale.
+    parts.evaluate(EASY, options)
+    whole = runs.load(EASY)
+    assert [episode["seed"] for episode in whole["episodes"]] == [1000, 1001, 1002] and whole["success_rate"] == 1.0
+    assert "easy: 3 of 3 levels, solved 3 (100.0 %)" in capfd.readouterr().out
+    EASY.file.unlink()
+    monkeypatch.setattr(parts.Part, "start", lambda part: pytest.fail(f"{part} has been measured already"))
+    parts.evaluate(EASY, options)
+    assert runs.load(EASY) == whole
+
+
+def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        lines = [
+            {"step": step, "instruction/move": 1.0, "instruction/move_n": 1, "instruction/push": 0.5,
+             "instruction/push_n": 3} for step in (10, 20)
+        ]  # fmt: skip
+        (tmp_path / name / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    points = curves.read_curve("controller", [tmp_path / "first", tmp_path / "second"])
+    assert [(p["step"], p["value"]) for p in points] == [(10, 0.625), (20, 0.625), (30, 0.625), (40, 0.625)]
+    with pytest.raises(runs.ResultError, match="fewer than 3 points of solve_rate/5"):
+        curves.read_curve("planner", [tmp_path / "first"])
+    with pytest.raises(runs.ResultError, match="missing: expected the run directory"):
+        curves.read_curve("planner", [tmp_path / "missing"])
