@@ -60,7 +60,10 @@ class OutcomeSummary:
                 self.failures[failure_name(outcome)] += 1
 
     def report(self) -> dict[str, Any]:
-        """Return success rate with interval, median and 95th-percentile ticks by kind, and the failures."""
+        """Return success rate with interval, and median and 95th-percentile ticks by kind, and the failures.
+
+        `feasible` counts all instructions but those towards walls and blocked boxes.
+        """
         kinds = {}
         for kind, n in sorted(self.count.items()):
             ticks = self.ticks.get(kind, [])
@@ -71,7 +74,11 @@ class OutcomeSummary:
                 "median_steps": float(np.median(ticks)) if ticks else None,
                 "p95_steps": float(np.percentile(ticks, 95)) if ticks else None,
             }
-        return {"kinds": kinds, "failures": dict(self.failures), "displaced": self.displaced}
+        feasible = [kind for kind in kinds if kind != "blocked"]
+        n, completed = sum(self.count[k] for k in feasible), sum(len(self.ticks.get(k, [])) for k in feasible)
+        together = {"n": n, "completed": completed, "success_interval": list(wilson_interval(completed, n))}
+        failures = dict(self.failures)
+        return {"kinds": kinds, "feasible": together, "failures": failures, "displaced": self.displaced}
 
 
 class SeededEpisodes:

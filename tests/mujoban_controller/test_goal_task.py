@@ -124,6 +124,15 @@ def test_the_scripted_driver_solves_whole_levels():
     assert report["instructions"]["kinds"]["move"]["success_rate"] == 1.0
 
 
+def test_the_scripted_driver_pushes_fast_and_keeps_boxes_on_their_lanes():
+    # In level 4030 a box jams when the robot still bends to its lane while it touches the box.
+    instructions = judge(scripted_driver, OraclePlanner(), episodes=4, first_seed=4028, difficulty=5)["instructions"]
+    assert instructions["failures"] == {}
+    feasible = instructions["feasible"]
+    assert feasible["n"] == feasible["completed"] == sum(kind["n"] for kind in instructions["kinds"].values())
+    assert instructions["kinds"]["push"]["median_steps"] <= 36
+
+
 def test_controllers_and_drivers_are_judged_alike():
     report = judge(OracleController(), OraclePlanner(), episodes=2, first_seed=7, difficulty=1)
     assert report["success_rate"] == 1.0
