@@ -1,8 +1,9 @@
 """What the live view costs: ticks per second of the graph in lockstep with `--view` and without.
 
-``run`` measures both in turns, several times, so that what else the machine does hits them alike; the ratio is the
-median over the rounds. The viewer has started before the clock does, and no browser is open, which costs what drawing
-costs on its machine. ``python -m benchmarks.view`` prints it as JSON.
+``run`` measures both in turns, several times, so that what else the machine does hits them alike; ratios are medians
+over the rounds. The viewer has started before the clock does, and no browser is open, which costs what drawing costs
+on its machine. The processor time of the graph's process says the same on a machine that is busy otherwise: where a
+core is free for the viewer, the rate falls as much as this time grows. ``python -m benchmarks.view`` prints it as JSON.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import statistics
 import time
 import urllib.request
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from urllib.error import URLError
 
@@ -20,6 +22,8 @@ import tyro
 from bringup.command import Choice, Stack
 from bringup.domain import claim_domain
 from bringup.live import free_port
+from bringup.monitor import MonitorNode
+from bringup.results import EpisodeResult
 from bringup.stack import PlayOptions, play, viewer
 from mujoban_sim.episodes import Episodes
 from mujoban_sim.plugins import ROLES
@@ -55,27 +59,44 @@ def _await_page(port: int) -> None:
             time.sleep(0.2)
 
 
+def _measure(stack: Stack, episodes: Episodes, ticks: int) -> tuple[float, float]:
+    """Return ticks per second, and milliseconds of processor time that this process spends on a tick."""
+    seen: list[tuple[int, float]] = []
+
+    def note(monitor: MonitorNode, _: Sequence[EpisodeResult]) -> None:
+        seen.append((monitor.ticks, time.process_time()))
+
+    rate = play(stack, episodes, PlayOptions(time_limit=ticks), on_refresh=note).ticks_per_second
+    # From the first tick on: making the nodes does not count.
+    running = [(tick, seconds) for tick, seconds in seen if tick > 0]
+    (first, start), (last, end) = running[0], running[-1]
+    return rate, 1000 * (end - start) / (last - first)
+
+
 def run(options: Options | None = None) -> dict[str, float]:
-    """Return ticks per second of the graph without and with the live view, and their ratio."""
+    """Return ticks per second and processor time of the graph without and with the live view, and their ratios."""
     chosen = options or Options()
     torch.set_num_threads(1)
     stack = Stack({role: Choice(role, "oracle" if role in chosen.oracle else "learned") for role in ROLES})
     episodes = Episodes(1, chosen.seed, difficulty=chosen.difficulty)
-    length = PlayOptions(time_limit=chosen.ticks)
-    rates: list[tuple[float, float]] = []
+    plain: list[tuple[float, float]] = []
+    viewed: list[tuple[float, float]] = []
     with claim_domain():
         play(stack, episodes, PlayOptions(time_limit=20))
         for _ in range(chosen.rounds):
-            plain = play(stack, episodes, length).ticks_per_second
+            plain.append(_measure(stack, episodes, chosen.ticks))
             port = free_port(WEB_PORT)
             with viewer():
                 _await_page(port)
-                rates.append((plain, play(stack, episodes, length).ticks_per_second))
+                viewed.append(_measure(stack, episodes, chosen.ticks))
+    pairs = list(zip(plain, viewed, strict=True))
     return {
-
-        "ticks_per_second": statistics.median(plain for plain, _ in rates),
-        "ticks_per_second_with_view": statistics.median(viewed for _, viewed in rates),
-        "with_view_of_without": statistics.median(viewed / plain for plain, viewed in rates),
+        "ticks_per_second": statistics.median(rate for rate, _ in plain),
+        "ticks_per_second_with_view": statistics.median(rate for rate, _ in viewed),
+        "rate_with_view_of_without": statistics.median(b / a for (a, _), (b, _) in pairs),
+        "milliseconds_of_processor": statistics.median(cost for _, cost in plain),
+        "milliseconds_of_processor_with_view": statistics.median(cost for _, cost in viewed),
+        "processor_without_view_of_with": statistics.median(a / b for (_, a), (_, b) in pairs),
     }
 
 

@@ -36,7 +36,9 @@ APPLICATION: Final = "mujoban"
 NICENESS: Final = 10
 """Of the node's process: the graph comes first."""
 _PERIOD: Final = 0.1
-"""Seconds between two pictures: 10 Hz is enough for the eye."""
+"""Seconds between two pictures in the browser: 10 Hz is enough for the eye."""
+_TICKS: Final = 4
+"""Ticks between two pictures."""
 _QUEUE: Final = 16
 """Ticks that wait for the stream; what comes on top is dropped."""
 _EDGE: Final = 256
@@ -132,9 +134,9 @@ class LiveNode(Node):
         return receive
 
     def _is_drawn(self, stamp: int) -> bool:
-        """Tell whether the pictures of a tick are shown: every other tick's, and not more often than `_PERIOD`."""
+        """Tell whether the pictures of a tick are shown: those of every `_TICKS`, and not more often than `_PERIOD`."""
         now = time.monotonic()
-        if stamp != self._pictured and stamp // TICK % 2 == 0 and now - self._drawn >= self._period:
+        if stamp != self._pictured and stamp // TICK % _TICKS == 0 and now - self._drawn >= self._period:
             self._pictured, self._drawn = stamp, now
         return stamp == self._pictured
 
