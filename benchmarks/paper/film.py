@@ -8,6 +8,7 @@ draws frames where it likes.
 from __future__ import annotations
 
 import json
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -90,32 +91,44 @@ def load() -> dict[str, Any] | None:
     return read_source(source(), ("seed", "difficulty", "weights", "instructions", "torque"), RERUN)
 
 
-def draw(episode: dict[str, Any], file: Path) -> None:
-    """Play the episode again and draw first-person frames above frames from above.
+def play(
+    episode: dict[str, Any], moments: Collection[int], top_size: int = _TOP_SIZE
+) -> Iterator[tuple[int, NDArray[np.uint8], NDArray[np.uint8]]]:
+    """Play the episode again and yield (step, first-person frame, frame from above) at the given steps.
 
     Raises:
         ResultError: If the level is not solved at its end: the world has changed since.
         RenderingError: If there is no OpenGL.
     """
     torque = np.array(episode["torque"], np.float32)
-    moments = np.linspace(0, len(torque), _COLUMNS).round().astype(int)
     levels = Episodes(1, episode["seed"], difficulty=episode["difficulty"])
     world = World(1, max_boxes=levels.max_boxes)
     world.reset([0], [levels[0]])
-    figure, axes = plt.subplots(2, _COLUMNS, figsize=(1.5 * _COLUMNS, 3.4), layout="constrained")
     for step in range(len(torque) + 1):
         if step in moments:
-            column = int(np.flatnonzero(moments == step)[0])
-            axes[0, column].imshow(world.render()[0], interpolation="nearest")
-            axes[1, column].imshow(world.render("top_down", size=_TOP_SIZE)[0])
-            axes[0, column].set_title(f"{step * CONTROL_PERIOD:.1f} s {_arrow(episode['instructions'], step)}")
+            yield step, world.render()[0], world.render("top_down", size=top_size)[0]
         if step < len(torque):
             world.step(torque[step][None])
+    if not world.solved[0]:
+        raise ResultError(f"the world has changed since the film strip's episode was recorded; rerun {RERUN}")
+
+
+def draw(episode: dict[str, Any], file: Path) -> None:
+    """Draw first-person frames above frames from above.
+
+    Raises:
+        ResultError: If the episode cannot be played again.
+        RenderingError: If there is no OpenGL.
+    """
+    moments = np.linspace(0, len(episode["torque"]), _COLUMNS).round().astype(int).tolist()
+    frames = list(play(episode, moments))
+    figure, axes = plt.subplots(2, _COLUMNS, figsize=(1.5 * _COLUMNS, 3.4), layout="constrained")
+    for column, (step, first_person, top_down) in enumerate(frames):
+        axes[0, column].imshow(first_person, interpolation="nearest")
+        axes[1, column].imshow(top_down)
+        axes[0, column].set_title(f"{step * CONTROL_PERIOD:.1f} s {_arrow(episode['instructions'], step)}")
     for panel in axes.flat:
         panel.set_axis_off()
-    if not world.solved[0]:
-        plt.close(figure)
-        raise ResultError(f"the world has changed since the film strip's episode was recorded; rerun {RERUN}")
     figure.savefig(file, dpi=110)
     plt.close(figure)
 

@@ -1,0 +1,62 @@
+"""A short animation for pages: `python -m benchmarks.paper.animation docs/images/episode.gif`.
+
+Plays the recorded episode of Figure 3 again and draws what the robot sees beside the view from above.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from PIL import Image
+
+from benchmarks.paper import film
+from mujoban_sim.rendering import RenderingError
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is drawn."""
+
+    path: Annotated[Path, tyro.conf.Positional] = Path("docs/images/episode.gif")
+    frames: int = 72
+    size: int = 160
+    """Pixels along the edges of each of the two pictures."""
+    milliseconds: int = 110
+    """Between two frames."""
+    colours: int = 64
+
+
+def main(options: Options) -> None:
+    """Write the animation.
+
+    Raises:
+        ValueError: If no episode has been recorded, or the world has changed since.
+        RenderingError: If there is no OpenGL.
+    """
+    episode = film.load()
+    if episode is None:
+        raise ValueError(f"no episode has been recorded yet: {film.RERUN}")
+    moments = np.linspace(0, len(episode["torque"]), options.frames).round().astype(int)
+    pictures: list[Image.Image] = []
+    for _, first_person, top_down in film.play(episode, moments.tolist(), top_size=options.size):
+        left = Image.fromarray(first_person).resize((options.size, options.size), Image.Resampling.NEAREST)
+        pair = np.concatenate([np.asarray(left), top_down], axis=1)
+        # Maximum coverage keeps the few pixels of a target or a box as bright as they are.
+        picture = Image.fromarray(pair)
+        pictures.append(picture.quantize(options.colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE))
+    pictures[0].save(
+        options.path, save_all=True, append_images=pictures[1:], duration=options.milliseconds, loop=0, optimize=True
+    )
+    print(f"{options.path}: {options.path.stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options, prog="benchmarks.paper.animation"))
+    except (ValueError, OSError, RenderingError) as failure:
+        sys.exit(f"animation: error: {' '.join(str(failure).split())}")
