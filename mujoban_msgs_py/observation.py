@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from rclpy.node import Node
+from rclpy.qos import ReliabilityPolicy
 from std_msgs.msg import Header
 
 from mujoban_msgs_py import conversions, topics
@@ -15,6 +16,8 @@ from mujoban_sim.world import EpisodeSpec, World
 
 _NEEDED = (topics.EPISODE, topics.CAMERA, topics.PROPRIO, topics.POSE)
 """What the modules cannot do without."""
+GLANCE = 4
+"""Ticks between two views from above where all who read it ask for best effort, as those do who only watch."""
 
 
 class TickLabel(NamedTuple):
@@ -33,13 +36,14 @@ class ObservationPublisher:
     """Publishes the state of the only row of a world.
 
     Ground truth and the view from above, which cost time and which no learned module receives, are published
-    while somebody subscribes to them.
+    while somebody subscribes to them; the view from above only now and then while nobody needs all of it.
     """
 
     def __init__(self, node: Node, world: World, top_camera_size: int) -> None:
         """Make the publishers of `topics.SIMULATOR_TOPICS` on a node."""
         if world.batch != 1:
             raise ValueError(f"world has {world.batch} rows: the graph plays 1")
+        self._node = node
         self._world = world
         self._top_camera_size = top_camera_size
         self._joints = list(world.body.joints)
@@ -62,6 +66,7 @@ class ObservationPublisher:
             topics.TOP_CAMERA: self._top_camera,
         }
         self._on_demand = {*topics.TRUTH_TOPICS, topics.TOP_CAMERA, topics.CAMERA_INFO}
+        self._top_readers, self._top_period = 0, 1
 
     def matched(self, *, everything: bool) -> bool:
         """Tell whether somebody subscribes to what the modules need, or to everything."""
@@ -71,8 +76,20 @@ class ObservationPublisher:
     def publish(self, label: TickLabel) -> None:
         """Publish the world as it is now."""
         for topic, publisher in self._publishers.items():
-            if topic not in self._on_demand or publisher.get_subscription_count():
+            if topic not in self._on_demand or self._is_wanted(topic, label.stamp):
                 publisher.publish(self._composers[topic](label))
+
+    def _is_wanted(self, topic: Topic, stamp: int) -> bool:
+        readers = self._publishers[topic].get_subscription_count()
+        if topic is not topics.TOP_CAMERA or not readers:
+            return readers > 0
+        if readers != self._top_readers:
+            known = self._node.get_subscriptions_info_by_topic(topic.name)
+            # Not all may be known yet: then they are looked at again in the next tick.
+            self._top_readers = len(known)
+            glances = all(info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in known)
+            self._top_period = GLANCE if glances and len(known) == readers else 1
+        return stamp // topics.TICK % self._top_period == 0
 
     def _episode(self, label: TickLabel) -> Any:
         world = self._world

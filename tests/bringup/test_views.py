@@ -6,12 +6,14 @@ import pytest
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from visualization_msgs.msg import Marker, MarkerArray
 
 from bringup.overlay import BAR, CELL, MARGIN, grid_picture
 from bringup.video import EDGE, VideoNode
 from bringup.viz import VizNode, occupancy_grid
-from mujoban_msgs_py import conversions
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.observation import GLANCE
 from mujoban_sim.episodes import Episodes
 from mujoban_sim.grid import BOX, TARGET, WALL, cell_to_xy
 
@@ -89,3 +91,15 @@ def test_a_video_shows_both_views_and_what_the_modules_say(play_graph, tmp_path)
     line = frames[0][-BAR:, :EDGE]
     assert (line > 200).any() and (line < 40).any(), "the instruction is written at the bottom"
     assert not (frames[0][-BAR:, EDGE:] == frames[0][-BAR:, :EDGE]).all()
+
+
+@pytest.mark.parametrize(("reliability", "period"), [("BEST_EFFORT", GLANCE), ("RELIABLE", 1)])
+def test_the_view_from_above_is_drawn_as_often_as_its_readers_need(play_graph, reliability, period):
+    graph = play_graph(episodes=Episodes(4, 0, difficulty=2))
+    node = graph.graph.add(Node("watcher"))
+    stamps = []
+    qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy[reliability])
+    topic = topics.TOP_CAMERA
+    node.create_subscription(topic.type, topic.name, lambda m: stamps.append(conversions.stamp_of(m)), qos)
+    graph.spin_until(lambda: len(stamps) > 12)
+    assert set(np.diff(stamps[4:])) == {period * topics.TICK}
