@@ -1,20 +1,22 @@
-"""Look before you push: a turn on the spot at the start of an episode, before the planner's first decision.
+"""Look before you push: turns on the spot, and walks to where more can be seen, while the map is uncertain.
 
 Irreversible pushes into the unknown are the first cause of failure under partial observation (paper, section 4). Two
-wrappers make any planner and any controller look around first: the planner tells the robot to stay, and the
-controller turns on the spot when it is told so. Each counts the ticks of the episode for itself.
+wrappers make any planner and any controller look around: the planner tells the robot to stay where it wants a look, or
+to walk to such a place, and the controller turns on the spot when it is told to stay. Neither pushes a box for it.
 
-Shapes: B robots, M of them with a decision to take, U actuators.
+Shapes: B robots, M of them with a decision to take, V viewpoints, N = `grid.GRID_SIZE`, U actuators.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.grid import Instruction
+from mujoban_sim.bodies import BALL
+from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
 from mujoban_sim.interfaces import (
     Controller,
     ControllerInput,
@@ -25,81 +27,108 @@ from mujoban_sim.interfaces import (
     put_rows,
     take_rows,
 )
+from mujoban_sim.visibility import cells_in_view
 
 LOOK_AROUND_TICKS: Final = 40
 """Ticks in which the ball turns once at `_TURN`; what a learned estimator gets by default."""
+WALKS: Final = 30
+"""Instructions that an episode spends at most on looks after the first and on the way there, by default."""
+MIN_GAIN: Final = 3
+"""Cells that a viewpoint must promise to be worth a walk."""
+_UNCERTAIN: Final = (0.05, 0.95)
+"""A cell is unknown where the probability of a wall lies between these and no look has shown it."""
+_OPAQUE: Final = 0.9
+"""Probability of a wall from which on it hides what lies behind; guesses about unseen cells stay below."""
+_FREE: Final = 0.3
+"""Probability of a wall or a box up to which the robot dares to walk into a cell."""
+_WALK_COST: Final = 0.5
+"""Cells of gain that one step of the way is worth."""
+_HEADINGS: Final = 0.4 * math.pi * np.arange(5)
+"""Views that together make a turn, given the camera's 80 degrees."""
 _TURN: Final = 0.7
 """Torque of the turn."""
 _STEER: Final = 1
 """Actuator that turns the body."""
+_CELLS: Final = GRID_SIZE * GRID_SIZE
 
 AnyModule = TypeVar("AnyModule", bound=Module)
 
 
 class LookAroundPlanner(Planner):
-    """Says STAY for the first ticks of an episode, then what another planner says.
+    """Looks around first, and wherever there is something to be seen; else says what another planner says.
 
-    Memory: that of the other planner, and the ticks of the episode, int64 [B].
+    Memory: that of the other planner; the tick of the episode and that at which the present look ends (0: none), int64
+    [B]; the instructions left for looking, int64 [B]; the cells that looks have shown, bool [B, N, N].
     """
 
-    def __init__(self, inner: Planner, ticks: int) -> None:
-        """Wrap `inner`, whose first decision comes with the first beta after `ticks` ticks."""
-        self.inner, self.ticks = inner, ticks
+    def __init__(self, inner: Planner, ticks: int, walks: int = WALKS) -> None:
+        """Wrap `inner`; a look takes `ticks` ticks, and later looks and the way there `walks` instructions at most."""
+        self.inner, self.ticks, self.walks = inner, ticks, walks
         self.privileged = inner.privileged
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return the memory at the start of `batch` episodes."""
-        return (*self.inner.initial_memory(batch), np.zeros(batch, np.int64))
+        """Return the memory at the start of `batch` episodes, each of which begins with a look."""
+        tick, until = np.zeros(batch, np.int64), np.full(batch, self.ticks)
+        seen = np.zeros((batch, GRID_SIZE, GRID_SIZE), np.bool_)
+        return (*self.inner.initial_memory(batch), tick, until, np.full(batch, self.walks), seen)
 
     def decide(
         self, abstract_state: NDArray[np.float32], memory: Memory
     ) -> tuple[NDArray[np.int64], Memory]:
-        """Return STAY where it is still time to look, else the other planner's instruction; [M] and the memory."""
-        *others, tick = memory
-        inner = tuple(others)
+        """Return STAY for a look, a step towards one, or the other planner's instruction, [M], and the memory."""
+        inner, (tick, until, walks, seen) = tuple(memory[:-4]), memory[-4:]
+        until, walks, seen = until.copy(), walks.copy(), seen.copy()
         decision = np.full(len(tick), int(Instruction.STAY), np.int64)
-        ready = np.flatnonzero(tick >= self.ticks)
-        if ready.size:
-            decision[ready], after = self.inner.decide(abstract_state[ready], take_rows(inner, ready))
-            inner = put_rows(inner, ready, after)
-        return decision, (*inner, tick)
+        ready = np.zeros(len(tick), np.bool_)
+        for i in np.flatnonzero(tick >= until):
+            if until[i] > 0:  # A look has just ended: what it did not make certain will not become so from here
+                seen[i] |= turn_view(abstract_state[i])
+                until[i] = 0
+            step = None if walks[i] == 0 else step_to_view(abstract_state[i], seen[i])
+            if step is None:
+                ready[i] = True
+                continue
+            walks[i] -= 1
+            decision[i] = step
+            if step == Instruction.STAY:
+                until[i] = tick[i] + self.ticks
+        rows = np.flatnonzero(ready)
+        if rows.size:
+            decision[rows], after = self.inner.decide(abstract_state[rows], take_rows(inner, rows))
+            inner = put_rows(inner, rows, after)
+        return decision, (*inner, tick, until, walks, seen)
 
     def step(
         self, abstract_state: NDArray[np.float32], terminated: NDArray[np.bool_], state: PlannerState
     ) -> tuple[NDArray[np.int64], PlannerState]:
         """Return A_t, [B], and count the tick."""
         instruction, state = super().step(abstract_state, terminated, state)
-        *inner, tick = state.memory
-        return instruction, state._replace(memory=(*inner, tick + 1))
+        *others, tick, until, walks, seen = state.memory
+        return instruction, state._replace(memory=(*others, tick + 1, until, walks, seen))
 
 
 class LookAroundController(Controller):
-    """Turns on the spot where the first ticks of an episode ask it to STAY; else does what another controller does.
+    """Turns on the spot where the robot is to STAY; else does what another controller does, whose memory it keeps."""
 
-    Memory: that of the other controller, and the ticks of the episode, int64 [B].
-    """
-
-    def __init__(self, inner: Controller, ticks: int) -> None:
-        """Wrap `inner`, which acts from tick `ticks` on."""
-        self.inner, self.ticks = inner, ticks
+    def __init__(self, inner: Controller) -> None:
+        """Wrap `inner`."""
+        self.inner = inner
         self.privileged = inner.privileged
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return the memory at the start of `batch` episodes."""
-        return (*self.inner.initial_memory(batch), np.zeros(batch, np.int64))
+        """Return the other controller's memory at the start of `batch` episodes."""
+        return self.inner.initial_memory(batch)
 
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques, [B, U], and the next memory; the other controller sees every tick."""
-        *inner, tick = state
-        torque, after = self.inner.step(inputs, tuple(inner))
-        looking = (tick < self.ticks) & (inputs.instruction == int(Instruction.STAY))
+        torque, memory = self.inner.step(inputs, state)
         turn = np.zeros_like(torque)
         turn[:, _STEER] = _TURN
-        return np.where(looking[:, None], turn, torque), (*after, tick + 1)
+        return np.where((inputs.instruction == int(Instruction.STAY))[:, None], turn, torque), memory
 
 
 def look_around(module: AnyModule, ticks: int) -> AnyModule | LookAroundPlanner | LookAroundController:
-    """Return a module that looks around for the first ticks of each episode; estimators do so anyway.
+    """Return a planner or controller that looks around, `ticks` a look; 0, or another module: itself.
 
     Raises:
         ValueError: If `ticks` is negative.
@@ -109,5 +138,58 @@ def look_around(module: AnyModule, ticks: int) -> AnyModule | LookAroundPlanner 
     if ticks and isinstance(module, Planner):
         return LookAroundPlanner(module, ticks)
     if ticks and isinstance(module, Controller):
-        return LookAroundController(module, ticks)
+        return LookAroundController(module)
     return module
+
+
+def step_to_view(abstract_state: NDArray[np.float32], seen: NDArray[np.bool_]) -> Instruction | None:
+    """Return the first step to where a turn shows most that is unknown; STAY for here, None if nowhere does.
+
+    Args:
+        abstract_state: Estimate, [N, N, 4].
+        seen: Cells that looks have shown, [N, N].
+    """
+    wall = abstract_state[..., WALL]
+    unknown = (wall > _UNCERTAIN[0]) & (wall < _UNCERTAIN[1]) & ~seen
+    unknown[[0, -1]] = unknown[:, [0, -1]] = False
+    if unknown.sum() < MIN_GAIN:
+        return None
+    distance, first = _walks(abstract_state)
+    cells = np.flatnonzero(distance >= 0)
+    gain = (_views(wall, cells) & unknown.ravel()).sum(1)
+    worth = np.where(gain >= MIN_GAIN, gain - _WALK_COST * distance[cells], -np.inf)
+    best = int(np.argmax(worth))
+    return Instruction(int(first[cells[best]])) if np.isfinite(worth[best]) else None
+
+
+def turn_view(abstract_state: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which cells a turn in the robot's cell shows, by an estimate, [N, N] from [N, N, 4]."""
+    here = np.argmax(abstract_state[..., AGENT])
+    return _views(abstract_state[..., WALL], np.array([here])).reshape(GRID_SIZE, GRID_SIZE)
+
+
+def _views(wall: NDArray[np.float32], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which cells a turn in each of `cells`, [V], shows, [V, N * N]."""
+    half = (GRID_SIZE - 1) / 2
+    x, y = cells % GRID_SIZE - half, half - cells // GRID_SIZE
+    turns = len(_HEADINGS)
+    pose = np.stack([np.repeat(x, turns), np.repeat(y, turns), np.tile(_HEADINGS, len(cells))], -1)
+    opaque = np.broadcast_to(wall > _OPAQUE, (len(pose), GRID_SIZE, GRID_SIZE))
+    return np.any(cells_in_view(opaque, pose, BALL.camera).reshape(len(cells), turns, _CELLS), axis=1)
+
+
+def _walks(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the walking distance to each cell, [N * N], -1 where none leads, and the first step of the way."""
+    free = (abstract_state[..., WALL] < _FREE) & (abstract_state[..., BOX] < _FREE)
+    distance, first = np.full(_CELLS, -1), np.full(_CELLS, int(Instruction.STAY))
+    start = int(np.argmax(abstract_state[..., AGENT]))
+    distance[start], queue = 0, [start]
+    for cell in queue:
+        for instruction in list(Instruction)[1:]:
+            row, column = np.array(divmod(cell, GRID_SIZE)) + OFFSETS_RC[instruction]
+            beside = int(row * GRID_SIZE + column)
+            if free[row, column] and distance[beside] < 0:
+                distance[beside] = distance[cell] + 1
+                first[beside] = instruction if cell == start else first[cell]
+                queue.append(beside)
+    return distance, first

@@ -3,10 +3,28 @@ import pytest
 
 from bringup.rollout import ticks
 from mujoban_sim.episodes import Episodes
-from mujoban_sim.look_around import LOOK_AROUND_TICKS, look_around
+from mujoban_sim.grid import AGENT, BOX, WALL, Instruction
+from mujoban_sim.look_around import LOOK_AROUND_TICKS, LookAroundPlanner, look_around, step_to_view
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.sense_plan_act import SensePlanAct
 from mujoban_sim.world import World
+
+NOTHING_SEEN = np.zeros((10, 10), np.bool_)
+
+
+def estimate(*rows):
+    """Return an estimate whose interior is drawn: '#' wall, ' ' floor, '$' box, '@' robot, '?' never seen."""
+    state = np.zeros((10, 10, 4), np.float32)
+    state[..., WALL] = 1.0
+    for r, row in enumerate(rows, 1):
+        for c, cell in enumerate(row, 1):
+            state[r, c, WALL] = {"#": 0.99, "?": 0.75}.get(cell, 0.01)
+            state[r, c, BOX] = cell == "$"
+            state[r, c, AGENT] = cell == "@"
+    return state
+
+
+ROOM = ("########", "#@  ####", "#   ####", "## #####", "## ?????", "## ?????", "########", "########")
 
 
 def test_the_robot_turns_once_on_the_spot_then_solves_the_level_as_ever():
@@ -25,6 +43,45 @@ def test_the_robot_turns_once_on_the_spot_then_solves_the_level_as_ever():
     assert turned > 0.9 * 2 * np.pi
     assert np.abs(np.array(places[:looking]) - places[0]).max() < 0.1
     assert solved
+
+
+def test_the_robot_walks_to_where_it_sees_into_the_unknown_room_and_looks_there():
+    state = estimate(*ROOM)
+    way = []
+    for _ in range(20):
+        step = step_to_view(state, NOTHING_SEEN)
+        if step == Instruction.STAY:
+            break
+        assert step is not None
+        way.append(step)
+        row, column = np.argwhere(state[..., AGENT] > 0.5)[0]
+        offset = {1: (-1, 0), 2: (0, 1), 3: (1, 0), 4: (0, -1)}[int(step)]
+        state[row, column, AGENT] = 0.0
+        assert state[row + offset[0], column + offset[1], WALL] < 0.5
+        state[row + offset[0], column + offset[1], AGENT] = 1.0
+    assert len(way) >= 3 and state[5:7, 3, AGENT].any()
+
+
+def test_no_walk_where_all_is_known_was_looked_at_or_lies_behind_a_box():
+    known = tuple(row.replace("?", "#") for row in ROOM)
+    assert step_to_view(estimate(*known), NOTHING_SEEN) is None
+    assert step_to_view(estimate(*ROOM), estimate(*ROOM)[..., WALL] == np.float32(0.75)) is None
+    closed = (*ROOM[:3], "##$#####", *ROOM[4:])
+    step = step_to_view(estimate(*closed), NOTHING_SEEN)
+    assert step is None or step == Instruction.STAY  # boxes hide nothing, but are in the way
+
+
+def test_looks_come_to_an_end():
+    planner = LookAroundPlanner(OraclePlanner(), 2, walks=5)
+    state = estimate(*ROOM)[None]
+    state[0, 1, 1, BOX] = 0.0
+    now = planner.initial_state(np.zeros(1, np.int64))
+    instructions = []
+    for _ in range(12):
+        instruction, now = planner.step(state, np.array([True]), now)
+        instructions.append(int(instruction[0]))
+    assert instructions[:2] == [0, 0]
+    assert now.memory[-2][0] == 0
 
 
 def test_a_negative_time_is_refused():
