@@ -39,7 +39,9 @@ class Options:
 def points(lines: Iterable[Mapping[str, Any]], every: int, offset: int = 0) -> list[dict[str, float]]:
     """Return step, value and number of instructions of each stretch of `every` steps that had any."""
     bins: dict[int, list[float]] = {}
+    last = 0
     for line in lines:
+        last = line["step"]
         counts = [line.get(f"instruction/{kind}_n", 0.0) for kind in KINDS]
         if not sum(counts):
             continue
@@ -48,7 +50,7 @@ def points(lines: Iterable[Mapping[str, Any]], every: int, offset: int = 0) -> l
         entry[0] += completed
         entry[1] += sum(counts)
     return [
-        {"step": offset + (b + 1) * every, "value": completed / n, "instructions": round(n)}
+        {"step": offset + min((b + 1) * every, last), "value": completed / n, "instructions": round(n)}
         for b, (completed, n) in sorted(bins.items())
     ]
 

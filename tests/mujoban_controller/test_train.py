@@ -109,5 +109,5 @@ def test_a_curve_weighs_instructions_alike_and_counts_the_steps_before():
     ]
     assert points(lines, 10, offset=100) == [
         {"step": 110, "value": 0.75, "instructions": 4},
-        {"step": 130, "value": 0.5, "instructions": 2},
+        {"step": 125, "value": 0.5, "instructions": 2},
     ]
