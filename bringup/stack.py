@@ -115,6 +115,8 @@ def play(
             monitor.create_timer(refresh_period, lambda: on_refresh(monitor, monitor.results))
         spin(graph.executor, monitor.finished, received)
         monitor.finished.result()
+        if on_refresh is not None:  # a short run may have ended before the first refresh
+            on_refresh(monitor, monitor.results)
         _drain(graph.executor, listeners, monitor.stamp)
         counts = processes.restarts if options.processes else graph.counts()
         return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts)
