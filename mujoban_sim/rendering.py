@@ -9,9 +9,9 @@ from __future__ import annotations
 import importlib
 import os
 import weakref
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Final, Literal, TypeVar
+from collections.abc import Sequence
+from concurrent.futures import Future
+from typing import Any, Final, Literal
 
 import mujoco
 import numpy as np
@@ -29,13 +29,13 @@ from mujoban_sim.grid import GRID_SIZE, cell_to_xy
 from mujoban_sim.levels import Level
 from mujoban_sim.render_scene import TOP_DOWN_CAMERA, UNSEEN_GROUP, RenderScene, build_scene, write_level
 from mujoban_sim.scene import BOX_HALF_EXTENT
+from mujoban_sim.worker import Worker
 
 CameraName = Literal["first_person", "top_down"]
 CAMERAS: Final[tuple[CameraName, ...]] = (FIRST_PERSON_CAMERA, TOP_DOWN_CAMERA)
 """Names of the cameras: o_cam and o_top (paper appendix B)."""
 
 _MAX_GEOMS: Final = 200
-_T = TypeVar("_T")
 
 
 class RenderingError(RuntimeError):
@@ -75,16 +75,13 @@ class _Painter:
         self._size = size
         self._slots = slots
         self._max_boxes = max_boxes
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="painter")
+        self._worker = Worker("painter")
+        self.submit = self._worker.submit
         try:
             self._scene: RenderScene = self.submit(self._open).result()
         except BaseException:
-            self._thread.shutdown()
+            self._worker.end()
             raise
-
-    def submit(self, function: Callable[..., _T], *args: Any) -> Future[_T]:
-        """Run a function in the painter's thread."""
-        return self._thread.submit(function, *args)
 
     @property
     def qpos_size(self) -> int:
@@ -168,9 +165,9 @@ class _Painter:
     def close(self, *, wait: bool = True) -> None:
         """Free the context, in the thread to which it belongs, and end the thread."""
         freed = self.submit(self._close)
+        self._worker.end()
         if wait:
             freed.result()
-        self._thread.shutdown(wait=wait)
 
     def _close(self) -> None:
         self._context.free()

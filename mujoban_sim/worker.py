@@ -1,0 +1,65 @@
+"""A thread of its own for what belongs to one thread, such as an OpenGL context."""
+
+from __future__ import annotations
+
+import atexit
+import threading
+import weakref
+from collections.abc import Callable
+from concurrent.futures import Future
+from queue import SimpleQueue
+from typing import Any, TypeVar
+
+_T = TypeVar("_T")
+
+
+class Worker:
+    """Runs functions in one thread, in their order.
+
+    Unlike those of `concurrent.futures.ThreadPoolExecutor`, `submit` and `end` take no lock: the garbage collector may
+    call them, through a finalizer, in a thread that holds any lock, even while that thread starts a pool of its own.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Start the thread, which does not keep the interpreter from ending."""
+        self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=_work, args=(self._jobs,), name=name, daemon=True)
+        self._thread.start()
+        _WORKERS.add(self)
+
+    def submit(self, function: Callable[..., _T], *args: Any) -> Future[_T]:
+        """Run a function in the thread, after those before it."""
+        future: Future[_T] = Future()
+
+        def job() -> None:
+            try:
+                future.set_result(function(*args))
+            except BaseException as error:
+                future.set_exception(error)
+
+        self._jobs.put(job)
+        return future
+
+    def end(self) -> None:
+        """Let the thread end after what was submitted, without waiting for it."""
+        self._jobs.put(None)
+
+    def join(self) -> None:
+        """Wait until the thread has ended."""
+        self._thread.join()
+
+
+def _work(jobs: SimpleQueue[Callable[[], None] | None]) -> None:
+    while (job := jobs.get()) is not None:
+        job()
+
+
+_WORKERS: weakref.WeakSet[Worker] = weakref.WeakSet()
+
+
+@atexit.register
+def _end_all() -> None:
+    """Let what was submitted finish before the interpreter goes: a library must not be cut off in the middle."""
+    for worker in list(_WORKERS):
+        worker.end()
+        worker.join()
