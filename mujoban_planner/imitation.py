@@ -67,7 +67,7 @@ class ImitationConfig(NetworkConfig):
     """Weights to start from, where names and shapes agree."""
     noise: float = 0.1
     """Share of a batch whose abstract states are blurred, as estimates are."""
-    hidden: float = 0.25
+    hidden: float = 0.4
     """Share of a batch that shows only what the robot may have seen so far."""
     mix: Shares = (0.03, 0.04, 0.06, 0.12, 0.75)
     """Shares of difficulties 1 to 5 among the training levels."""
