@@ -3,7 +3,8 @@
     python -m benchmarks.paper.curves --planner runs/planner --estimator runs/estimator --controller runs/a runs/b
 
 writes one `curve_<module>.jsonl` for each module named, an object a line with `step`, `value` and `what` the value is.
-Several runs of a module are joined in the order given, as when a run starts from the weights of another.
+Several runs of a module are joined in the order given, as when a run starts from the weights of another; `--append`
+goes on after the points that the file has. `--variant mpo` writes `curve_<module>_mpo.jsonl`, a curve to draw beside.
 """
 
 from __future__ import annotations
@@ -60,17 +61,20 @@ class Options:
     estimator: tuple[Path, ...] = ()
     """Estimator and termination are trained together: name the run for both."""
     termination: tuple[Path, ...] = ()
+    variant: str = ""
+    """Name of another way to train, whose curve stands beside that of the shipped weights."""
+    append: bool = False
+    """Go on after the last point of the file, as where the metrics of earlier runs are lost."""
     out: Path = JSON
 
 
-def read_curve(module: str, runs: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return the points of a module's curve over one or more runs.
+def read_curve(module: str, runs: Sequence[Path], offset: float = 0.0) -> list[dict[str, Any]]:
+    """Return the points of a module's curve over one or more runs, after `offset` samples of those before.
 
     Raises:
         ResultError: If a run has no metrics, or nothing of what is drawn.
     """
     lines: list[tuple[float, dict[str, Any]]] = []
-    offset = 0.0
     for run in runs:
         try:
             metrics = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
@@ -80,18 +84,18 @@ def read_curve(module: str, runs: Sequence[Path]) -> list[dict[str, Any]]:
         lines += [(offset + scale * line["step"], line) for line in metrics]
         offset = lines[-1][0] if lines else offset
     for measure in MEASURES[module]:
-        points = [(step, value) for step, line in lines if (value := _value(line, measure)) is not None]
+        points = [(step, *value) for step, line in lines if (value := _value(line, measure)) is not None]
         if len(points) >= _FEWEST:
             return [{"step": round(step), "value": value, "what": measure.what} for step, value in _thin(points)]
     wanted = ", ".join(key for measure in MEASURES[module] for key in measure.keys)
     raise ResultError(f"{', '.join(map(str, runs))}: fewer than {_FEWEST} points of {wanted}")
 
 
-def _value(line: dict[str, Any], measure: Measure) -> float | None:
-    """Return the measure's value in a line of the metrics, or None if it has none."""
+def _value(line: dict[str, Any], measure: Measure) -> tuple[float, float] | None:
+    """Return the measure's value in a line of the metrics and its count, or None if it has none."""
     present = [(line[key], line.get(f"{key}_n", 1.0)) for key in measure.keys if line.get(key) is not None]
     total = sum(count for _, count in present)
-    return sum(value * count for value, count in present) / total if total else None
+    return (sum(value * count for value, count in present) / total, total) if total else None
 
 
 def _samples_per_step(run: Path) -> float:
@@ -103,21 +107,25 @@ def _samples_per_step(run: Path) -> float:
         return 1.0
 
 
-def _thin(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return at most `_MOST` points, each the mean of those in its stretch."""
+def _thin(points: Sequence[tuple[float, float, float]]) -> list[tuple[float, float]]:
+    """Return at most `_MOST` points (step, value), each the mean over the counts in its stretch."""
     stretches = np.array_split(np.array(points), min(len(points), _MOST))
-    return [(float(part[-1, 0]), round(float(part[:, 1].mean()), 5)) for part in stretches]
+    return [(float(part[-1, 0]), round(float(np.average(part[:, 1], weights=part[:, 2])), 5)) for part in stretches]
 
 
 def main(options: Options) -> None:
     """Write the curves of the modules whose runs are named."""
     for module in MODULES:
         runs: tuple[Path, ...] = getattr(options, module)
-        if runs:
-            points = read_curve(module, runs)
-            text = "".join(json.dumps(point) + "\n" for point in points)
-            write_atomically(options.out / f"curve_{module}.jsonl", text.encode())
-            print(f"{module}: {len(points)} points of {points[0]['what']!r}")
+        if not runs:
+            continue
+        file = options.out / "_".join(filter(None, ("curve", module, options.variant)))
+        file = file.with_suffix(".jsonl")
+        before = file.read_text() if options.append else ""
+        last = json.loads(before.splitlines()[-1])["step"] if before else 0.0
+        points = read_curve(module, runs, last)
+        write_atomically(file, (before + "".join(json.dumps(point) + "\n" for point in points)).encode())
+        print(f"{file.name}: {len(points)} points of {points[0]['what']!r}")
 
 
 if __name__ == "__main__":

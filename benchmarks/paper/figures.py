@@ -49,6 +49,8 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
 def curves(file: Path) -> list[str]:
     """Draw the learning curves of the modules (paper Fig. 4) that there are; return the modules without one.
 
+    Beside that of the shipped weights stand the variants of a module, such as MPO alone.
+
     Raises:
         ResultError: If a curve is not what `benchmarks.paper.curves` writes.
     """
@@ -59,7 +61,13 @@ def curves(file: Path) -> list[str]:
         for axes in panels[0][len(found) :]:
             axes.set_axis_off()
         for axes, (module, points) in zip(panels[0], found.items(), strict=False):
-            axes.plot([p["step"] / 1e6 for p in points], [p["value"] for p in points], marker=".", markersize=3)
+            prefix = f"curve_{module}_"
+            others = {f.stem.removeprefix(prefix): _points(f) for f in sorted(sources.JSON.glob(f"{prefix}*.jsonl"))}
+            for name, curve in {"shipped": points, **others}.items():
+                steps, values = [p["step"] / 1e6 for p in curve], [p["value"] for p in curve]
+                axes.plot(steps, values, marker=".", markersize=3, label=name)
+            if others:
+                axes.legend(fontsize="small")
             axes.set(title=module, xlabel="million samples", ylabel=points[0].get("what", ""))
             axes.grid(alpha=0.3)
         figure.savefig(file, dpi=110)

@@ -80,6 +80,16 @@ def test_an_evaluation_goes_on_where_it_was_ended_and_gives_what_one_run_gives(f
     assert runs.load(EASY) == whole
 
 
+def test_a_long_curve_is_thinned_to_means_that_weigh_instructions_alike(tmp_path):
+    lines = [
+        {"step": step, "instruction/move": float(step % 2), "instruction/move_n": 1 + 2 * (step % 2)}
+        for step in range(400)
+    ]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    points = curves.read_curve("controller", [tmp_path])
+    assert len(points) == 200 and {p["value"] for p in points} == {0.75}
+
+
 def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
@@ -90,6 +100,10 @@ def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
         (tmp_path / name / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     points = curves.read_curve("controller", [tmp_path / "first", tmp_path / "second"])
     assert [(p["step"], p["value"]) for p in points] == [(10, 0.625), (20, 0.625), (30, 0.625), (40, 0.625)]
+    curves.main(curves.Options(controller=(tmp_path / "first", tmp_path / "second"), variant="mpo", out=tmp_path))
+    curves.main(curves.Options(controller=(tmp_path / "first",) * 2, variant="mpo", append=True, out=tmp_path))
+    written = [json.loads(line)["step"] for line in (tmp_path / "curve_controller_mpo.jsonl").read_text().splitlines()]
+    assert written == [10, 20, 30, 40, 50, 60, 70, 80]
     with pytest.raises(runs.ResultError, match="fewer than 3 points of solve_rate/5"):
         curves.read_curve("planner", [tmp_path / "first"])
     with pytest.raises(runs.ResultError, match="missing: expected the run directory"):

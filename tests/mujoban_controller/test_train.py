@@ -12,7 +12,6 @@ import torch
 
 from mujoban_controller import load
 from mujoban_controller.controller import VisuomotorController
-from mujoban_controller.curves import points
 from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
 from mujoban_controller.goal_task import GoalTaskConfig
 from mujoban_controller.mpo import MPOTrainingConfig
@@ -98,16 +97,3 @@ def test_imitation_prefers_the_teachers_torque():
 def test_a_teacher_without_distillation_is_refused():
     with pytest.raises(ValueError, match="only the stage distil"):
         TrainConfig(stage="mpo", teacher=Path("teacher.safetensors"))
-
-
-def test_a_curve_weighs_instructions_alike_and_counts_the_steps_before():
-    lines = [
-        {"step": 5, "instruction/move": 1.0, "instruction/move_n": 3.0},
-        {"step": 10, "instruction/push": 0.0, "instruction/push_n": 1.0, "instruction/stay": 0.0},
-        {"step": 15, "loss": 1.0},
-        {"step": 25, "instruction/move": 0.5, "instruction/move_n": 2.0},
-    ]
-    assert points(lines, 10, offset=100) == [
-        {"step": 110, "value": 0.75, "instructions": 4},
-        {"step": 125, "value": 0.5, "instructions": 2},
-    ]
