@@ -35,6 +35,10 @@ class Options:
     oracle: tuple[str, ...] = ()
     """Roles that oracles play; none by default."""
 
+    def stack(self) -> Stack:
+        """Return the stack to measure."""
+        return Stack({role: Choice(role, "oracle" if role in self.oracle else "learned") for role in ROLES})
+
 
 def _in_process(policy: SensePlanAct, episodes: Episodes, ticks: int) -> float:
     world = World(1, max_boxes=episodes.max_boxes, time_limit=ticks)
@@ -49,7 +53,7 @@ def run(options: Options | None = None) -> dict[str, float]:
     """Return ticks per second of graph and rollout with batch 1, and their ratio."""
     chosen = options or Options()
     torch.set_num_threads(1)
-    stack = Stack({role: Choice(role, "oracle" if role in chosen.oracle else "learned") for role in ROLES})
+    stack = chosen.stack()
     policy = stack.policy()
     episodes = Episodes(1, chosen.seed, difficulty=chosen.difficulty)
     _in_process(policy, episodes, 20)

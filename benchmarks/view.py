@@ -13,38 +13,25 @@ import statistics
 import time
 import urllib.request
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from urllib.error import URLError
 
 import torch
 import tyro
 
-from bringup.command import Choice, Stack
+from benchmarks.graph import Options
+from bringup.command import Stack
 from bringup.domain import claim_domain
 from bringup.live import free_port
 from bringup.monitor import MonitorNode
 from bringup.results import EpisodeResult
 from bringup.stack import PlayOptions, play, viewer
 from mujoban_sim.episodes import Episodes
-from mujoban_sim.plugins import ROLES
 
 WEB_PORT = 9090
 """Where the viewer looks for a free port."""
 START_LIMIT = 60.0
 """Seconds that the viewer has to start."""
-
-
-@dataclass
-class Options:
-    """What is measured."""
-
-    ticks: int = 300
-    """Of each contestant in a round."""
-    rounds: int = 5
-    difficulty: int = 5
-    seed: int = 0
-    oracle: tuple[str, ...] = ()
-    """Roles that oracles play; none by default."""
 
 
 def _await_page(port: int) -> None:
@@ -77,7 +64,7 @@ def run(options: Options | None = None) -> dict[str, float]:
     """Return ticks per second and processor time of the graph without and with the live view, and their ratios."""
     chosen = options or Options()
     torch.set_num_threads(1)
-    stack = Stack({role: Choice(role, "oracle" if role in chosen.oracle else "learned") for role in ROLES})
+    stack = chosen.stack()
     episodes = Episodes(1, chosen.seed, difficulty=chosen.difficulty)
     plain: list[tuple[float, float]] = []
     viewed: list[tuple[float, float]] = []
