@@ -151,8 +151,8 @@ def add_module_options(parser: argparse.ArgumentParser) -> None:
         "--look-around",
         type=int,
         metavar="TICKS",
-        help=f"turn on the spot for so long before the first decision; {LOOK_AROUND_TICKS} by default, "
-        "0 for the oracle estimator",
+        help="look around before the first decision, and walk to where more can be seen: the length of each turn on "
+        f"the spot, 0 for none; {LOOK_AROUND_TICKS} by default, 0 for the oracle estimator",
     )
 
 

@@ -9,6 +9,7 @@ import yaml
 
 from bringup.command import Stack
 from mujoban_sim.episodes import Episodes
+from mujoban_sim.look_around import LOOKING_ROLES
 from mujoban_sim.plugins import ROLES
 
 DEFAULTS = Path(__file__).parent / "config" / "stack.yaml"
@@ -59,6 +60,7 @@ def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Para
             "module": choice.source,
             "weights": "" if choice.weights is None else str(choice.weights),
             "device": stack.device,
-            "look_around": stack.look_around_ticks,
         }
+    for role in LOOKING_ROLES:
+        parameters[role]["look_around"] = stack.look_around_ticks
     return parameters

@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.tick_node import Input, Output, TickNode
 from mujoban_sim.interfaces import GroundTruth
-from mujoban_sim.look_around import look_around
+from mujoban_sim.look_around import LOOKING_ROLES, look_around
 from mujoban_sim.plugins import LEARNED, load_module
 
 TRUTH_INPUTS = (
@@ -37,8 +37,8 @@ class ModuleNode(TickNode):
             runs loads them, and the module's memory restarts with the next tick. Weights that cannot be loaded
             are refused, and the old ones stay.
         device: Device of the learned module; setting it loads the weights again.
-        look_around: Ticks at the start of an episode in which planner and controller let the robot turn on the spot
-            before the planner's first decision; fixed when the node starts.
+        look_around: Of planner and controller alone: ticks of a look, which is a turn on the spot; 0 for none. Fixed
+            when the node starts.
     """
 
     role: ClassVar[str]
@@ -56,8 +56,10 @@ class ModuleNode(TickNode):
         self._source: str = source
         weights: Any = self.declare_parameter("weights", "").value
         device: Any = self.declare_parameter("device", "cpu").value
-        ticks: Any = self.declare_parameter("look_around", 0, ParameterDescriptor(read_only=True)).value
-        self._look_around: int = ticks
+        self._look_around = 0
+        if self.role in LOOKING_ROLES:
+            ticks: Any = self.declare_parameter("look_around", 0, ParameterDescriptor(read_only=True)).value
+            self._look_around = ticks
         self.module: Any = self._load(weights, device)
         self.state: Any = None
         self._episode = -1

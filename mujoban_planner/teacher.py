@@ -156,12 +156,13 @@ def _label_demonstrations(levels: LevelBatch, found: Demonstrations) -> tuple[Sa
 
 def _judge_instructions(samples: Samples) -> Samples:
     """Return samples of demonstrations with the verdicts on instructions that follow from those on pushes."""
-    known = EVERY_INSTRUCTION & ~possible_pushes(samples.boards)  # Walking loses nothing
+    pushing = possible_pushes(samples.boards)
+    known = EVERY_INSTRUCTION & ~pushing  # Walking loses nothing
     dead = np.zeros_like(samples.dead)
     for direction, step in enumerate(SQUARE_STEP.tolist()):
         # Beyond the edge there is no box, so whatever square stands there has no verdict.
         ahead = np.clip(samples.agent.astype(np.int64) + step, 0, SQUARES - 1).astype(np.uint64)
-        beside = (possible_pushes(samples.boards) >> (direction + 1)) & 1
+        beside = (pushing >> (direction + 1)) & 1
         for mask, pushes in ((known, samples.push_known), (dead, samples.push_dead)):
             mask |= ((pushes[:, direction] >> ahead).astype(np.uint8) & beside) << np.uint8(direction + 1)
     return samples._replace(dead_known=known | samples.right, dead=dead)

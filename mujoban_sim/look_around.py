@@ -31,6 +31,8 @@ from mujoban_sim.visibility import cells_in_view
 
 LOOK_AROUND_TICKS: Final = 40
 """Ticks in which the ball turns once at `_TURN`; what a learned estimator gets by default."""
+LOOKING_ROLES: Final = ("planner", "controller")
+"""The roles that `look_around` wraps."""
 WALKS: Final = 30
 """Instructions that an episode spends at most on looks after the first and on the way there, by default."""
 MIN_GAIN: Final = 3
