@@ -19,7 +19,7 @@ from mujoban_sim.bodies import ROBOT_BODY, ROBOT_DEFAULTS, Body
 from mujoban_sim.camera import in_view
 from mujoban_sim.grid import GRID_SIZE
 from mujoban_sim.meshes import DRAWN_WALL_HEIGHT, MAX_QUADS, Mesh, level_mesh, skyline_mesh
-from mujoban_sim.scene import BOX_HALF_EXTENT
+from mujoban_sim.scene import BOX_HALF_EXTENT, box_vertices
 
 TOP_DOWN_CAMERA: Final = "top_down"
 """Name of the camera that sees the whole grid from above, north up; it yields o_top."""
@@ -45,10 +45,9 @@ class RenderScene:
 
 def _mjcf(body: Body, max_boxes: int, size: int) -> str:
     cell = body.cell_size
-    half = " ".join(str(h * cell) for h in BOX_HALF_EXTENT)
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
     boxes = "".join(
-        f'<body>{slides}<geom name="box{i}" type="box" size="{half}" pos="0 0 {BOX_HALF_EXTENT[2] * cell}"/></body>'
+        f'<body>{slides}<geom name="box{i}" size="{cell}" pos="0 0 {BOX_HALF_EXTENT[2] * cell}"/></body>'
         for i in range(max_boxes)
     )
     pads = "".join(
@@ -114,8 +113,11 @@ def build_scene(body: Body, max_boxes: int, slots: int, size: int) -> RenderScen
     for slot in range(slots):
         _add_mesh(spec, f"level{slot}", blank, ATLAS_SHAPE)
     _add_mesh(spec, "skyline", skyline_mesh(body.cell_size), SKYLINE_SHAPE)
+    spec.add_mesh(name="box", uservert=box_vertices(body.cell_size).ravel().tolist())
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
+        if geom.name.startswith("box"):
+            geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, "box"
     for name, mesh in (("static", "level0"), ("skyline", "skyline")):
         spec.worldbody.add_geom(
             name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, material=mesh, contype=0, conaffinity=0

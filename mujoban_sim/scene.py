@@ -32,6 +32,11 @@ _SETTLING_TIME: Final = 2.0
 
 BOX_HALF_EXTENT: Final = (0.4, 0.4, 0.15)
 """Half edges of a box in cells."""
+BOX_CHAMFER: Final = 0.05
+"""How much of a box's vertical edges is cut off, in cells: so a box slides between the next pegs, and back into its
+lane, from 0.15 cells off it instead of 0.1. With more, the pegs let go of a box too early in a push."""
+BOX_FRICTION: Final = 0.1
+"""Sliding friction of a box with all but the floor. With more, a robot that bends its way drags the box aside."""
 BOX_MASS: Final = 2.5
 """Mass of a box in kg, the same for every body (paper A.3)."""
 PEG_HALF_DIAGONAL: Final = 0.05
@@ -59,12 +64,16 @@ _TEMPLATE: Final = """
     <geom friction="0.5 0.005 0.0001"/>
     <default class="slide"><joint type="slide"/></default>
     <default class="static"><geom type="box" contype="1" conaffinity="3" condim="3"/></default>
-    <default class="box"><geom type="box" contype="2" conaffinity="3" condim="3" mass="{box_mass}"/></default>
+    <default class="box">
+      <geom type="mesh" mesh="box" contype="2" conaffinity="3" condim="3" mass="{box_mass}" priority="1"
+            friction="{box_friction} 0.005 0.0001"/>
+    </default>
     <default class="foot">
       <geom type="sphere" size="0.02" pos="0 0 0.02" contype="0" conaffinity="0" mass="0"/>
     </default>
     {robot_defaults}
   </default>
+  <asset><mesh name="box" vertex="{box_vertices}"/></asset>
   <worldbody>
     <geom name="floor" type="plane" size="1 1 1" contype="4" conaffinity="4"/>
     {static}
@@ -125,6 +134,8 @@ def scene_mjcf(wall: NDArray[np.bool_], max_boxes: int, body: Body) -> str:
     return _TEMPLATE.format(
         step=PHYSICS_STEP,
         box_mass=BOX_MASS,
+        box_friction=BOX_FRICTION,
+        box_vertices=" ".join(f"{x:.6g}" for x in box_vertices(body.cell_size).ravel()),
         robot_defaults=ROBOT_DEFAULTS,
         static="".join(_walls(wall, body.cell_size) + _pegs(wall, body.cell_size)),
         boxes="".join(_box(i, body.cell_size) for i in range(max_boxes)),
@@ -155,10 +166,17 @@ def _pegs(wall: NDArray[np.bool_], cell_size: float) -> list[str]:
     return geoms + [f'<geom {shape} pos="{i} 5 -20"/>' for i in range(_PEG_CAPACITY - len(geoms))]
 
 
+def box_vertices(cell_size: float) -> NDArray[np.float64]:
+    """Return the corners of a box around its centre in metres, [16, 3]; it is their convex hull."""
+    half = np.array(BOX_HALF_EXTENT)
+    corners = np.concatenate([half - [BOX_CHAMFER, 0.0, 0.0], half - [0.0, BOX_CHAMFER, 0.0]]).reshape(2, 3)
+    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 1, 3)
+    return cell_size * (signs * corners).reshape(-1, 3)
+
+
 def _box(index: int, cell_size: float) -> str:
-    half_x, half_y, half_z = (h * cell_size for h in BOX_HALF_EXTENT)
     # A millimetre of clearance under the box, so that the foot alone touches the floor.
-    geom = f'name="box{index}" size="{half_x} {half_y} {half_z}" pos="0 0 {half_z + 0.001}"'
+    geom = f'name="box{index}" pos="0 0 {BOX_HALF_EXTENT[2] * cell_size + 0.001}"'
     joints = "".join(
         f'<joint name="box{index}_{name}" class="slide" axis="{axis}"/>'
         for name, axis in (("x", "1 0 0"), ("y", "0 1 0"), ("z", "0 0 1"))

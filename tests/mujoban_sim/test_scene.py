@@ -80,6 +80,18 @@ def test_a_pushed_box_passes_between_pegs_and_stops_at_the_wall():
     assert data.qpos[1] == pytest.approx(cell_to_xy((4, 2))[1], abs=0.1)
 
 
+@pytest.mark.parametrize("offset", [0.05, 0.1, 0.14])
+def test_a_box_off_its_lane_slides_between_the_next_pegs(offset):
+    model = mujoco.MjModel.from_xml_string(scene_mjcf(closed(np.zeros((10, 10), bool)), 1, BALL))
+    data = mujoco.MjData(model)
+    data.qpos[:2] = cell_to_xy((4, 2)) + np.array([0.0, offset])
+    data.qpos[3:5] = cell_to_xy((8, 8))
+    while data.time < 4.0 and data.qpos[0] < cell_to_xy((4, 3))[0] - 0.1:
+        data.qfrc_applied[0] = 30.0 if data.qvel[0] < 1.0 else 0.0
+        mujoco.mj_step(model, data)
+    assert data.time < 4.0 and data.qpos[1] == pytest.approx(cell_to_xy((4, 2))[1], abs=0.06)
+
+
 def test_a_box_between_cells_is_held_by_pegs():
     model = mujoco.MjModel.from_xml_string(scene_mjcf(closed(np.zeros((10, 10), bool)), 1, BALL))
     data = mujoco.MjData(model)
