@@ -32,9 +32,9 @@ _SETTLING_TIME: Final = 2.0
 
 BOX_HALF_EXTENT: Final = (0.4, 0.4, 0.15)
 """Half edges of a box in cells."""
-BOX_CHAMFER: Final = 0.05
+BOX_CHAMFER: Final = 0.03
 """How much of a box's vertical edges is cut off, in cells: so a box slides between the next pegs, and back into its
-lane, from 0.15 cells off it instead of 0.1. With more, the pegs let go of a box too early in a push."""
+lane, from 0.12 cells off it instead of 0.1. With more, the pegs let go of a box too early in a push."""
 BOX_FRICTION: Final = 0.1
 """Sliding friction of a box with all but the floor. With more, a robot that bends its way drags the box aside."""
 BOX_MASS: Final = 2.5
