@@ -29,6 +29,8 @@ from mujoban_sim.interfaces import Memory, Planner
 
 INSTRUCTIONS = len(Instruction)
 INTERIOR = GRID_SIZE - 2
+CAUTION = 4.0
+"""Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/planner.md)."""
 
 
 class PlannerOutput(NamedTuple):
@@ -63,7 +65,7 @@ class LearnedPlanner(nn.Module, Planner):
         self.propagation = propagation
         self.thinking = 1
         """Thinking time: repeats of the recurrent core, or symmetric views, per decision; 1 is as trained."""
-        self.caution = 1.0
+        self.caution = CAUTION
         """Weight of the verdicts on pushes and instructions in a decision; 1 is as trained."""
 
     @property
@@ -80,13 +82,16 @@ class LearnedPlanner(nn.Module, Planner):
     def heads(self) -> PlannerHeads:
         """The read-out."""
 
-    def forward(self, abstract_state: Tensor) -> PlannerOutput:
-        """Return the heads' outputs for abstract states, float [B, N, N, 4] with values in [0, 1]."""
+    def forward(self, abstract_state: Tensor, caution: float = 1.0) -> PlannerOutput:
+        """Return the heads' outputs for abstract states, float [B, N, N, 4] with values in [0, 1].
+
+        With another `caution` than 1, the policy's logits weigh the verdicts on pushes otherwise than in training.
+        """
         planes = input_planes(abstract_state)
         spread = propagate(planes) if self.propagation else None
         inputs = planes if spread is None else torch.cat([planes, spread], 1)
         features = self.features(inputs.contiguous(memory_format=torch.channels_last))
-        return self.heads(features, planes, None if spread is None else spread[:, 0], self.caution)
+        return self.heads(features, planes, None if spread is None else spread[:, 0], caution)
 
     @property
     def inputs(self) -> int:
@@ -119,7 +124,7 @@ class LearnedPlanner(nn.Module, Planner):
 
     def evaluate(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return log pi(A | s) and log(1 - p(dead | s, A)), both [B, A], with the thinking time that is set."""
-        output = self(states)
+        output = self(states, self.caution)
         return functional.log_softmax(output.policy, 1), functional.logsigmoid(-output.dead)
 
 
