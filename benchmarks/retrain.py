@@ -8,6 +8,7 @@ commands are those of docs/estimator.md, "From a running stack to better weights
 from __future__ import annotations
 
 import json
+import resource
 import shlex
 import subprocess
 import sys
@@ -77,7 +78,7 @@ def judge(weights: Path, held_out: Path, options: Options) -> dict[str, Any]:
 
 
 def run(options: Options) -> dict[str, Any]:
-    """Return the seconds of each step, and what both pairs reach.
+    """Return the seconds of each step, the memory of the largest process in GiB, and what both pairs reach.
 
     Raises:
         FileExistsError: If the folder exists.
@@ -103,8 +104,9 @@ def run(options: Options) -> dict[str, Any]:
             "--config.steps", options.steps, "--seconds", options.seconds,
         ),
     }  # fmt: skip
+    largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
     pairs = {name: judge(folder, held_out, options) for name, folder in (("weak", weak), ("retrained", better))}
-    return {"seconds": seconds, **pairs}
+    return {"seconds": seconds, "largest_process_gib": largest, **pairs}
 
 
 if __name__ == "__main__":
