@@ -36,12 +36,12 @@ class Options:
     weak_steps: int = 200
     episodes: int = 200
     """Episodes that are recorded with the weak pair."""
-    steps: int = 1800
+    steps: int = 1400
     """Steps of the schedule of the retraining."""
-    seconds: float = 540.0
+    seconds: float = 480.0
     """Longest time of the retraining."""
     threads: int = 2
-    levels: int = 64
+    levels: int = 48
     """Levels on which both pairs are judged."""
 
 
