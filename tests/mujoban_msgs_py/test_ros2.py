@@ -27,7 +27,11 @@ COMMAND = [sys.executable, "-m", "mujoban_msgs_py.ros2.main"]
 
 
 def start(*arguments):
-    return subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # A shell ignores interrupts in what it runs in the background, and children inherit that.
+    return subprocess.Popen(
+        [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
 
 
 def ros2(*arguments, status=0):
