@@ -20,6 +20,7 @@ from typing import Any
 import tyro
 
 from mujoban_sim.generator import TEST_SEEDS
+from mujoban_sim.plugins import ROLES
 
 PAIR = ("estimator", "termination")
 
@@ -86,7 +87,7 @@ def run(options: Options) -> dict[str, Any]:
     options.run.mkdir(parents=True)
     first, own, held_out = (options.run / name for name in ("first", "own", "held_out"))
     weak, better = options.run / "weak", options.run / "better"
-    oracles = ("--oracle", "estimator,termination,planner,controller")
+    oracles = ("--oracle", ",".join(ROLES))
     record = ("bringup/record.py", "--difficulty", options.difficulty, "--time-limit", 500, "--processes", 2)
     train = ("-m", "mujoban_estimator.train", "--threads", options.threads)
     execute(*record, "--out", first, "--episodes", options.weak_episodes, "--seed", 40_000_000, *oracles)

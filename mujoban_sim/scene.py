@@ -169,7 +169,7 @@ def _pegs(wall: NDArray[np.bool_], cell_size: float) -> list[str]:
 def box_vertices(cell_size: float) -> NDArray[np.float64]:
     """Return the corners of a box around its centre in metres, [16, 3]; it is their convex hull."""
     half = np.array(BOX_HALF_EXTENT)
-    corners = np.concatenate([half - [BOX_CHAMFER, 0.0, 0.0], half - [0.0, BOX_CHAMFER, 0.0]]).reshape(2, 3)
+    corners = np.stack([half - [BOX_CHAMFER, 0.0, 0.0], half - [0.0, BOX_CHAMFER, 0.0]])
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 1, 3)
     return cell_size * (signs * corners).reshape(-1, 3)
 

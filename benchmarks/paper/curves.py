@@ -119,8 +119,7 @@ def main(options: Options) -> None:
         runs: tuple[Path, ...] = getattr(options, module)
         if not runs:
             continue
-        file = options.out / "_".join(filter(None, ("curve", module, options.variant)))
-        file = file.with_suffix(".jsonl")
+        file = options.out / ("_".join(filter(None, ("curve", module, options.variant))) + ".jsonl")
         before = file.read_text() if options.append else ""
         last = json.loads(before.splitlines()[-1])["step"] if before else 0.0
         points = read_curve(module, runs, last)
