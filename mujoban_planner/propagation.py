@@ -91,8 +91,21 @@ def walk_to_push(push: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
     return (gain * here).sum((2, 3)), (start * here).sum((2, 3))
 
 
+@torch.no_grad()
 def _spread(value: Tensor, mask: Tensor, decay: Tensor) -> Tensor:
-    """Return values [B, P, I, I] after they spread against each direction where mask [B, P, D, I, I] lets them."""
+    """Return values [B, P, I, I] after they spread against each direction where mask [B, P, D, I, I] lets them.
+
+    Works in place on a padded board, since the cost of one decision is that of its many small operations.
+    """
+    size = value.shape[-1]
+    board = functional.pad(value, (1, 1, 1, 1))
+    here = board[..., 1:-1, 1:-1]
+    neighbours = [
+        board[..., 1 + row : 1 + row + size, 1 + column : 1 + column + size] for row, column in _DIRECTIONS
+    ]
+    limits = [limit.contiguous() for limit in mask.unbind(2)]
     for _ in range(ITERATIONS):
-        value = torch.maximum(value, torch.minimum(mask, shifted(value)).amax(2) * decay)
-    return value
+        north, east, south, west = (torch.minimum(*pair) for pair in zip(limits, neighbours, strict=True))
+        best = torch.maximum(torch.maximum(north, east), torch.maximum(south, west))
+        torch.maximum(here, best.mul_(decay), out=here)
+    return here.clone()
