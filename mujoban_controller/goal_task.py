@@ -10,9 +10,11 @@ Shapes: B robots, M selected rows, P proprioceptive values, U actuators.
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,10 +32,13 @@ from mujoban_controller.instructions import (
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.grid import COMPLETION_TOLERANCE, DIFFICULTIES, INSTRUCTION_LIMIT, Instruction
 from mujoban_sim.interfaces import ControllerInput, Planner, put_rows, take_rows
+from mujoban_sim.levels import LevelError
 from mujoban_sim.world import EpisodeSpec, World
 
 EpisodeSource = Callable[[], EpisodeSpec]
 """Yields the next episode to play."""
+_REMEMBERED = 256
+"""Failures that are kept to be tried again."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,9 @@ class GoalTaskConfig:
     horizon: float = 200.0
     """Mean steps of an episode, exponentially distributed. Short ones show more levels and appearances, without
     which a camera policy knows the 64 warehouses that it is in by heart; `inf` goes on until the level is solved."""
+    retry: float = 0.0
+    """Share of episodes that begin where a feasible instruction failed before, in the same appearance. Failures get
+    rare long before they are few enough, and the same one then comes again and again in the level that has it."""
     patience: int = 3
     """Instructions that fail in a row before the episode is given up, since a jammed box stays jammed."""
     misaligned: float = 0.5
@@ -73,6 +81,8 @@ class GoalTaskConfig:
         """Reject settings that contradict each other."""
         if not self.horizon > 0:
             raise ValueError(f"horizon {self.horizon}: expected a positive number of steps")
+        if not 0.0 <= self.retry <= 1.0:
+            raise ValueError(f"retry {self.retry}: expected a share between 0 and 1")
         if self.difficulty not in DIFFICULTIES:
             raise ValueError(f"difficulty {self.difficulty}: expected one of {sorted(DIFFICULTIES)}")
         if not 0.0 < self.tolerance <= COMPLETION_TOLERANCE:
@@ -179,6 +189,7 @@ class GoalTask:
         self.planned = np.zeros(b, np.bool_)
         self._start_boxes = self.world.box_cell.copy()
         self._failures = np.zeros(b, np.int64)
+        self._failed_at: deque[EpisodeSpec] = deque(maxlen=_REMEMBERED)
         self._completed = np.zeros(b, np.bool_)
         self._horizon = np.full(b, math.inf)
         self._begin_episodes(np.arange(b))
@@ -217,6 +228,8 @@ class GoalTask:
         reward = config.completed_reward * (ended & completed) + config.failed_reward * failed
         reward -= config.drift_penalty * np.maximum(drift(world) - before, 0.0)
         reward -= config.backwards_penalty * (self.forward_speed < -0.05)
+        if config.retry > 0.0:
+            self._remember(np.flatnonzero(failed & (world.goals.kind != GoalKind.HOLD)))
         rows = np.flatnonzero(ended)
         # An instruction that the end of its episode cut short says nothing.
         judged = np.flatnonzero(ended & (completed | failed))
@@ -232,6 +245,22 @@ class GoalTask:
         if rows.size:
             self._issue(rows)
         return TaskStep(reward.astype(np.float32), (~(failed | over)).astype(np.float32), outcomes, episodes)
+
+    def _remember(self, rows: NDArray[np.int64]) -> None:
+        """Keep the situations in which the instructions in force began, to be tried again."""
+        for b in rows.tolist():
+            spec = self.world.episodes[b]
+            assert spec is not None
+            boxes = self._start_boxes[b, : self.world.box_count[b]]
+            y, x = self.world.goals.origin_cell[b].tolist()
+            # Where the robot or a box had strayed into the other's cell, there is no such level.
+            with contextlib.suppress(LevelError):
+                self._failed_at.append(replace(spec, level=replace(spec.level, boxes=boxes, player=(y, x))))
+
+    def _next_episode(self) -> EpisodeSpec:
+        if self._failed_at and self._rng.random() < self.config.retry:
+            return self._failed_at[int(self._rng.integers(len(self._failed_at)))]
+        return self._episodes()
 
     def _episode_end(self, row: int) -> EpisodeEnd:
         world = self.world
@@ -269,7 +298,7 @@ class GoalTask:
 
     def _begin_episodes(self, rows: NDArray[np.int64]) -> None:
         config, rng = self.config, self._rng
-        self.world.reset(rows, [self._episodes() for _ in rows])
+        self.world.reset(rows, [self._next_episode() for _ in rows])
         self._failures[rows] = 0
         if config.horizon < math.inf:
             self._horizon[rows] = rng.exponential(config.horizon, len(rows))

@@ -138,8 +138,22 @@ def test_controllers_and_drivers_are_judged_alike():
     assert report["success_rate"] == 1.0
 
 
+def test_what_failed_is_tried_again_from_where_it_began():
+    # Seeds 10,000,000 to 10,000,003 begin first; an idle robot fails in each of them.
+    task = make(planned=1.0, astray=0.0, misaligned=0.0, patience=1, horizon=np.inf, retry=1.0)
+    started = [(spec.seed, spec.level.player, spec.level.boxes.tolist()) for spec in task.world.episodes]
+    play(task, 121, idle)
+    again = [(spec.seed, spec.level.player, spec.level.boxes.tolist()) for spec in task.world.episodes]
+    assert set(map(str, again)) <= set(map(str, started))
+    fresh = make(planned=1.0, astray=0.0, misaligned=0.0, patience=1, horizon=np.inf)
+    play(fresh, 121, idle)
+    assert {spec.seed for spec in fresh.world.episodes}.isdisjoint(seed for seed, *_ in started)
+
+
 def test_settings_that_contradict_the_evaluation_are_refused():
     with pytest.raises(ValueError, match=r"tolerance 0\.2"):
         GoalTaskConfig(tolerance=0.2)
+    with pytest.raises(ValueError, match="retry 2"):
+        GoalTaskConfig(retry=2.0)
     with pytest.raises(ValueError, match="difficulty 9"):
         judging_config(4, difficulty=9)
