@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from benchmarks.timing import milliseconds
 from mujoban_controller.controller import Gaussian, VisuomotorController, gaussian, gaussian_layers
 from mujoban_controller.goal_task import GoalTaskConfig
 from mujoban_controller.train import TrainConfig, make_learner
@@ -46,16 +46,6 @@ class Options:
     random_steps: int = 0
     """Environment steps of random torques, summed over 64 robots."""
     seed: int = 0
-
-
-def milliseconds(step: Callable[[], object], repeats: int) -> float:
-    """Return the median processor time of a step in milliseconds."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        step()
-        times.append(time.process_time() - start)
-    return 1e3 * float(np.median(times))
 
 
 def step_time(repeats: int) -> float:

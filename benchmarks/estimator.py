@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 import tyro
 
+from benchmarks.timing import milliseconds
 from mujoban_estimator.bag_stream import ReadReport, find_bags, open_checked, stretches
 from mujoban_estimator.data import Batch
 from mujoban_estimator.estimator import StateEstimator
@@ -33,16 +33,6 @@ class Options:
     bags: tuple[Path, ...] = ()
     """Bags, or folders of bags, to read."""
     training_steps: int = 10
-
-
-def milliseconds(step: Callable[[], object], repeats: int) -> float:
-    """Return the median processor time of a step, in milliseconds."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        step()
-        times.append(time.process_time() - start)
-    return 1e3 * float(np.median(times))
 
 
 def step_times(repeats: int) -> dict[str, float]:

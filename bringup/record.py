@@ -10,9 +10,8 @@ import argparse
 import multiprocessing
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 from rich.console import Console
@@ -22,10 +21,9 @@ from bringup.command import Parser, Stack, add_module_options, import_from_here,
 from bringup.exploration import Disturbance, disturbed
 from bringup.rollout import ticks
 from mujoban_rl.training import StopSignal
+from mujoban_sim.episodes import LazyEpisodes, after_moves
 from mujoban_sim.generator import TRAIN_SEEDS, generate_level
 from mujoban_sim.grid import DIFFICULTIES
-from mujoban_sim.levels import Level
-from mujoban_sim.rules import apply
 from mujoban_sim.sense_plan_act import SensePlanAct
 from mujoban_sim.solver import solve_level
 from mujoban_sim.world import EpisodeSpec, World
@@ -35,7 +33,7 @@ _START_STREAM = 2
 """Tells the random stream of starting positions from others that a seed governs."""
 
 
-class MixedEpisodes(Sequence[EpisodeSpec]):
+class MixedEpisodes(LazyEpisodes):
     """Episodes of mixed difficulty, some of which begin in the middle of their solution.
 
     Episode i has seed `seed + i * stride`, which alone decides its level.
@@ -64,13 +62,9 @@ class MixedEpisodes(Sequence[EpisodeSpec]):
                 f"{count} episodes from seed {seed}, share {advanced} advanced: expected at least 1, a seed from 0, "
                 "a share from 0 to 1"
             )
-        self._count, self._seed, self._stride = count, seed, stride
+        super().__init__(count)
+        self._seed, self._stride = seed, stride
         self._difficulties, self._advanced = tuple(difficulties), advanced
-        self._made: dict[int, EpisodeSpec] = {}
-
-    def __len__(self) -> int:
-        """Return the number of episodes."""
-        return self._count
 
     def difficulty(self, index: int) -> int:
         """Return the difficulty of an episode."""
@@ -79,35 +73,14 @@ class MixedEpisodes(Sequence[EpisodeSpec]):
     def _rng(self, index: int) -> np.random.Generator:
         return np.random.default_rng([_START_STREAM, self._seed + index * self._stride])
 
-    @overload
-    def __getitem__(self, index: int) -> EpisodeSpec: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[EpisodeSpec]: ...
-    def __getitem__(self, index: int | slice) -> EpisodeSpec | list[EpisodeSpec]:
-        """Return one episode, or several."""
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        if not 0 <= index < self._count:
-            raise IndexError(f"episode {index} of {self._count}")
-        if index not in self._made:
-            seed = self._seed + index * self._stride
-            rng = self._rng(index)
-            rng.integers(len(self._difficulties))
-            level = generate_level(self.difficulty(index), seed)
-            if rng.random() < self._advanced:
-                level = advance(level, rng)
-            self._made[index] = EpisodeSpec(level, seed)
-        return self._made[index]
-
-
-def advance(level: Level, rng: np.random.Generator) -> Level:
-    """Return the level after a random part of the solver's solution, as a new level."""
-    moves = solve_level(level, weight=2.0).moves
-    boxes, player = level.boxes, np.array(level.player)
-    for move in moves[: rng.integers(0, max(1, len(moves) - 2))]:
-        result = apply(level.wall, level.target, boxes, player, move)
-        boxes, player = result.boxes, result.player
-    return replace(level, boxes=boxes, player=(int(player[0]), int(player[1])))
+    def _make(self, index: int) -> EpisodeSpec:
+        seed, rng = self._seed + index * self._stride, self._rng(index)
+        rng.integers(len(self._difficulties))
+        level = generate_level(self.difficulty(index), seed)
+        if rng.random() < self._advanced:
+            moves = solve_level(level, weight=2.0).moves
+            level = after_moves(level, moves[: rng.integers(0, max(1, len(moves) - 2))])
+        return EpisodeSpec(level, seed)
 
 
 @dataclass(frozen=True)

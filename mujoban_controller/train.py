@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,10 +30,9 @@ from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
 from mujoban_rl.weights import digest, load_weights, provenance, save_weights
+from mujoban_sim.episodes import after_moves
 from mujoban_sim.generator import TRAIN_SEEDS, generate_level
-from mujoban_sim.levels import Level
 from mujoban_sim.oracles import OraclePlanner
-from mujoban_sim.rules import apply
 from mujoban_sim.solver import solve_level
 from mujoban_sim.world import EpisodeSpec
 
@@ -112,18 +111,12 @@ def training_episodes(difficulty: int, rng: np.random.Generator) -> EpisodeSourc
         seed = int(rng.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop))
         if seed not in TRAIN_SEEDS:
             raise AssertionError(f"seed {seed} is not a training seed")
-        return EpisodeSpec(_advance(generate_level(difficulty, seed), rng), seed)
+        level = generate_level(difficulty, seed)
+        moves = solve_level(level, max_nodes=PLANNER_NODES).moves
+        done = int(rng.integers(len(moves))) if len(moves) else 0
+        return EpisodeSpec(after_moves(level, moves[:done]), seed)
 
     return draw
-
-
-def _advance(level: Level, rng: np.random.Generator) -> Level:
-    """Return the level after a random share of its solution's moves, but not solved."""
-    moves = solve_level(level, max_nodes=PLANNER_NODES).moves
-    boxes, player = level.boxes, np.array(level.player)
-    for move in moves[: int(rng.integers(len(moves)))] if len(moves) else ():
-        boxes, player, *_ = apply(level.wall, level.target, boxes, player, int(move))
-    return replace(level, boxes=boxes, player=(int(player[0]), int(player[1])))
 
 
 def make_learner(

@@ -2,18 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import overload
 
+import numpy as np
+
 from mujoban_sim.generator import generate_level
 from mujoban_sim.grid import DIFFICULTIES
 from mujoban_sim.levels import Level, read_levels
+from mujoban_sim.rules import apply
 from mujoban_sim.world import EpisodeSpec
 
 
-class Episodes(Sequence[EpisodeSpec]):
+def after_moves(level: Level, moves: Iterable[int]) -> Level:
+    """Return the level as it is after instructions were executed by the rules."""
+    boxes, player = level.boxes, np.array(level.player)
+    for move in moves:
+        boxes, player, *_ = apply(level.wall, level.target, boxes, player, int(move))
+    return replace(level, boxes=boxes, player=(int(player[0]), int(player[1])))
+
+
+class LazyEpisodes(Sequence[EpisodeSpec]):
+    """Numbered episodes, each made when it is first asked for."""
+
+    def __init__(self, count: int) -> None:
+        """Number `count` episodes from 0."""
+        self._count = count
+        self._made: dict[int, EpisodeSpec] = {}
+
+    @abstractmethod
+    def _make(self, index: int) -> EpisodeSpec:
+        """Return episode `index`; called once for each."""
+
+    def __len__(self) -> int:
+        """Return the number of episodes."""
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> EpisodeSpec: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[EpisodeSpec]: ...
+    def __getitem__(self, index: int | slice) -> EpisodeSpec | list[EpisodeSpec]:
+        """Return one episode, or several."""
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        if not 0 <= index < len(self):
+            raise IndexError(f"episode {index} of {len(self)}")
+        if index not in self._made:
+            self._made[index] = self._make(index)
+        return self._made[index]
+
+
+class Episodes(LazyEpisodes):
     """A run of episodes: episode i has seed `seed + i`.
 
     Its level is generated from that seed or, with a level file, is number i of the file, which starts
@@ -46,8 +90,7 @@ class Episodes(Sequence[EpisodeSpec]):
         self.levels = None if level_file is None else tuple(read_levels(level_file))
         self.seed = seed
         self._difficulty = difficulty
-        self._count = count if count is not None else len(self.levels or (None,))
-        self._made: dict[int, EpisodeSpec] = {}
+        super().__init__(count if count is not None else len(self.levels or (None,)))
 
     @property
     def difficulty(self) -> int:
@@ -61,25 +104,8 @@ class Episodes(Sequence[EpisodeSpec]):
             return DIFFICULTIES[self._difficulty][1]
         return max(len(level.boxes) for level in self.levels)
 
-    def __len__(self) -> int:
-        """Return the number of episodes."""
-        return self._count
-
-    @overload
-    def __getitem__(self, index: int) -> EpisodeSpec: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[EpisodeSpec]: ...
-    def __getitem__(self, index: int | slice) -> EpisodeSpec | list[EpisodeSpec]:
-        """Return one episode, or several."""
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        if not 0 <= index < len(self):
-            raise IndexError(f"episode {index} of {len(self)}")
-        if index not in self._made:
-            self._made[index] = EpisodeSpec(self._level(index), self.seed + index)
-        return self._made[index]
-
-    def _level(self, index: int) -> Level:
+    def _make(self, index: int) -> EpisodeSpec:
+        seed = self.seed + index
         if self.levels is None:
-            return generate_level(self._difficulty, self.seed + index)
-        return self.levels[index % len(self.levels)]
+            return EpisodeSpec(generate_level(self._difficulty, seed), seed)
+        return EpisodeSpec(self.levels[index % len(self.levels)], seed)
