@@ -42,8 +42,9 @@ class Options:
     """Levels played; all of a file when 0."""
     seed: int = 1000
     """Seed of the first generated level; the next ones follow."""
-    thinking: int = 1
-    """Repeats of the recurrent core (symmetric views of the residual network) per decision, relative to training."""
+    thinking: int | None = None
+    """Repeats of the recurrent core, relative to training, or symmetric views of the residual network, per decision;
+    the network's own by default."""
     caution: float | None = None
     """Weight of the verdicts on pushes in a decision; the planner's own by default."""
     look_ahead: bool = False
@@ -80,7 +81,8 @@ class Options:
 
 def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> dict[str, Any]:
     """Return the figures of a planner on levels."""
-    planner.thinking = options.thinking
+    if options.thinking is not None:
+        planner.thinking = options.thinking
     if options.caution is not None:
         planner.caution = options.caution
     player = LookAheadPlanner(planner, options.expansions) if options.look_ahead else planner
@@ -101,7 +103,7 @@ def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> d
         "move_limit": MOVE_LIMIT,
         "decisions_per_second": decisions / elapsed,
         "architecture": type(planner).__name__,
-        "thinking": options.thinking,
+        "thinking": planner.thinking,
         "caution": planner.caution,
         "look_ahead": options.look_ahead,
         "levels": str(options.levels) if options.levels else None,

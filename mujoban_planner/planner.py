@@ -31,6 +31,8 @@ INSTRUCTIONS = len(Instruction)
 INTERIOR = GRID_SIZE - 2
 CAUTION = 4.0
 """Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/planner.md)."""
+VIEWS = 2
+"""Symmetric views of the board that a residual network averages over by default: what 5 ms on one core allow."""
 
 
 class PlannerOutput(NamedTuple):
@@ -234,7 +236,10 @@ class ResidualBlock(nn.Module):
 
 
 class ResidualPlanner(LearnedPlanner):
-    """Residual network over the board. Its thinking time averages over symmetric views of the board."""
+    """Residual network over the board.
+
+    Its thinking time is the number of symmetric views of the board whose outputs it averages, in one forward pass.
+    """
 
     def __init__(self, channels: int = 64, blocks: int = 8, propagation: bool = True, judge: bool = False) -> None:
         """Build `blocks` residual blocks of `channels` channels."""
@@ -243,6 +248,7 @@ class ResidualPlanner(LearnedPlanner):
         self.encoder = nn.Conv2d(self.inputs, channels, 3, padding=1)
         self.blocks = nn.Sequential(*(ResidualBlock(channels) for _ in range(blocks)))
         self.readout = PlannerHeads(channels, propagation=propagation, judge=judge)
+        self.thinking = VIEWS
 
     @property
     def config(self) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from mujoban_planner.decision import HISTORY
 from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner, ResidualPlanner
 from mujoban_planner.play import play
 from mujoban_planner.symmetry import SYMMETRIES, instruction_map, instruction_permutation, transform_planes
+from mujoban_planner.validation import NetworkConfig
 from mujoban_sim.generator import generate_batch
 from mujoban_sim.grid import GRID_SIZE, Instruction
 from mujoban_sim.interfaces import take_rows
@@ -164,6 +165,16 @@ def test_shipped_planner_solves_easy_levels():
     torch.set_num_threads(1)
     game = play(planner, generate_batch(1, range(1000, 1100)))
     assert game.solved.sum() >= 98
+
+
+def test_decisions_average_two_views_by_default_and_training_takes_one():
+    planner, states = ResidualPlanner(16, 2).eval(), _states(4)
+    averaged = planner.scores(states)
+    planner.thinking = 2
+    assert np.array_equal(averaged, planner.scores(states))
+    planner.thinking = 1
+    assert not np.allclose(averaged, planner.scores(states))
+    assert NetworkConfig().build().thinking == 1
 
 
 def test_soft_views_average_to_a_symmetric_policy():
