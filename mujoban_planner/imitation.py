@@ -17,9 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_planner import load
+from mujoban_planner.growth import start_from
 from mujoban_planner.lessons import LessonMaker, LessonProcess
-from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch, SampleBuffer, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.uncertainty import blur, hide_unseen
@@ -305,17 +304,6 @@ class ImitationTrainer:
             "demonstrations": float(self.demonstrations.added),
             "corrections": float(self.corrections.added),
         }
-
-
-def start_from(network: LearnedPlanner, path: Path) -> None:
-    """Copy the weights of a trained planner where names and shapes agree; the rest keeps its initialisation.
-
-    Raises:
-        WeightsError: If the file is damaged.
-    """
-    trained = load(path).state_dict()
-    fitting = {k: v for k, v in network.state_dict().items() if k in trained and trained[k].shape == v.shape}
-    network.load_state_dict({k: trained[k] for k in fitting}, strict=False)
 
 
 def _convolutions_channels_last(network: nn.Module) -> None:

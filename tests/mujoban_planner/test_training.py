@@ -8,14 +8,16 @@ import torch
 
 import mujoban_planner
 from mujoban_planner import bag_transitions, train
+from mujoban_planner.growth import start_from
 from mujoban_planner.imitation import ImitationConfig, ImitationTrainer, imitation_loss
 from mujoban_planner.lessons import LessonMaker
+from mujoban_planner.planner import RecurrentPlanner, ResidualPlanner
 from mujoban_planner.reinforcement import LevelStream, MPOConfig, MPOTrainer, reset_stay_logit
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
-from mujoban_rl.weights import WeightsError
+from mujoban_rl.weights import WeightsError, save_weights
 from mujoban_sim.generator import TRAIN_SEEDS
-from mujoban_sim.grid import AGENT, BOX, TARGET, WALL
+from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
 
 SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
 
@@ -170,6 +172,22 @@ def test_bad_training_input_ends_with_one_line_and_status_2(tmp_path, monkeypatc
     assert exit_.value.code == 2
     error = capsys.readouterr().err.strip()
     assert "another configuration" in error and len(error.splitlines()) == 1
+
+
+def test_a_larger_network_begins_with_what_a_smaller_one_says(tmp_path):
+    torch.manual_seed(0)
+    small, path = ResidualPlanner(16, 1, judge=True), tmp_path / "small.safetensors"
+    for parameter in small.parameters():
+        torch.nn.init.normal_(parameter, 0.0, 0.1)
+    save_weights(path, small, small.config, {})
+    states = torch.rand(4, GRID_SIZE, GRID_SIZE, 4)
+    large = ResidualPlanner(24, 3, judge=True)
+    start_from(large, path)
+    for expected, given in zip(small(states), large(states), strict=True):
+        assert torch.allclose(expected, given, atol=1e-4)
+    for other in (ResidualPlanner(8, 1, judge=True), RecurrentPlanner(16, propagation=True, judge=True)):
+        with pytest.raises(WeightsError, match="at most the channels"):
+            start_from(other, path)
 
 
 def test_damaged_weights_are_refused(tmp_path):

@@ -1,0 +1,53 @@
+"""Start a planner network from the weights of a smaller one, so that it says the same at first.
+
+Further residual blocks begin as the identity (`ResidualBlock`). Further channels compute something from the start, but
+nothing that was there listens to them yet; training makes it listen.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mujoban_planner import load
+from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner
+from mujoban_rl.weights import WeightsError
+
+_POOLED = "inject.linear.weight"
+"""Weights whose inputs are two values for each channel."""
+
+
+def start_from(network: LearnedPlanner, path: Path) -> None:
+    """Give a network the weights of a trained planner that has the same or fewer channels and blocks.
+
+    Raises:
+        WeightsError: If the file is damaged, or its planner has another architecture, or more channels or blocks, or is
+            a smaller recurrent one, whose gates cannot grow.
+    """
+    trained = load(path)
+    ours, theirs = dict(network.named_parameters()), dict(trained.named_parameters())
+    fits = type(trained) is type(network) and all(k in ours and _holds(ours[k], v) for k, v in theirs.items())
+    if isinstance(network, RecurrentPlanner):
+        fits = fits and all(ours[k].shape == v.shape for k, v in theirs.items())
+    if not fits:
+        raise WeightsError(
+            f"{path}: a {type(trained).__name__} of {trained.config}, expected a {type(network).__name__} with at most "
+            f"the channels and blocks of {network.config}"
+        )
+    with torch.no_grad():
+        for name, weight in theirs.items():
+            _embed(ours[name], weight, pooled=name.endswith(_POOLED))
+
+
+def _holds(larger: Tensor, smaller: Tensor) -> bool:
+    return larger.dim() == smaller.dim() and all(n >= m for n, m in zip(larger.shape, smaller.shape, strict=True))
+
+
+def _embed(larger: Tensor, smaller: Tensor, *, pooled: bool) -> None:
+    """Copy weights [O, I, ...] into the first rows of larger ones, whose further inputs get zero there."""
+    if pooled:
+        larger, smaller = larger.unflatten(1, (2, -1)), smaller.unflatten(1, (2, -1))
+    larger[: len(smaller)] = 0.0
+    larger[tuple(slice(n) for n in smaller.shape)] = smaller
