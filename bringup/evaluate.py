@@ -31,6 +31,22 @@ from mujoban_sim.world import World
 PROG = "evaluate.py"
 
 
+class SolvedBar(Progress):
+    """Progress bar on stderr: how many episodes have ended, and how many of these were solved."""
+
+    def __init__(self, total: int, *, disable: bool = False) -> None:
+        """Count to `total` episodes."""
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        super().__init__(*columns, console=Console(stderr=True), disable=disable)
+        self._task = self.add_task("solved", total=total)
+
+    def show(self, results: Sequence[EpisodeResult]) -> None:
+        """Show the outcomes so far."""
+        if results:
+            share = sum(result.solved for result in results) / len(results)
+            self.update(self._task, completed=len(results), description=f"solved {100 * share:4.1f} %")
+
+
 def evaluate(
     policy: SensePlanAct,
     episodes: Episodes,
@@ -53,15 +69,12 @@ def evaluate(
     world = World(
         min(batch, len(episodes)), max_boxes=episodes.max_boxes, time_limit=time_limit, threads=threads
     )
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not progress) as bar:
-        task = bar.add_task("solved", total=len(episodes))
-        solved = finished = 0
+    with SolvedBar(len(episodes), disable=not progress) as bar:
+        ended: list[EpisodeResult] = []
 
         def on_result(_: int, result: EpisodeResult) -> None:
-            nonlocal solved, finished
-            solved, finished = solved + result.solved, finished + 1
-            bar.update(task, advance=1, description=f"solved {100 * solved / finished:4.1f} %")
+            ended.append(result)
+            bar.show(ended)
 
         return rollout(policy, world, episodes, on_result=on_result)
 
@@ -81,7 +94,11 @@ def main(command_line: Sequence[str] | None = None) -> int:
     if arguments.graph:
         from bringup.stack import PlayOptions, play
 
-        outcome = play(stack, episodes, PlayOptions(time_limit=arguments.time_limit))
+        options = PlayOptions(time_limit=arguments.time_limit)
+        with SolvedBar(len(episodes)) as bar:
+            outcome = play(
+                stack, episodes, options, on_refresh=lambda _, results: bar.show(results), refresh_period=1.0
+            )
         content = report(outcome.results, stack.identities(), ticks_per_second=outcome.ticks_per_second)
     else:
         import torch
