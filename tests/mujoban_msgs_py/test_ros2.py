@@ -126,6 +126,10 @@ def test_hz_measures_the_rate(talker):
 def test_pub_reaches_a_subscriber(talker):
     text = ros2("topic", "pub", "--once", "/chatter", "std_msgs/msg/String", "{data: hello}")
     assert "publisher: beginning loop\npublishing #1: std_msgs.msg.String(data='hello')\n" in text
+    # The command may be over before the talker's executor comes to the message.
+    deadline = time.monotonic() + 10.0
+    while not talker.heard and time.monotonic() < deadline:
+        time.sleep(0.01)
     assert talker.heard == ["hello"]
 
 
