@@ -10,10 +10,10 @@ Shapes: B robots, M selected rows, P proprioceptive values, U actuators.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -254,7 +254,7 @@ class GoalTask:
             boxes = self._start_boxes[b, : self.world.box_count[b]]
             y, x = self.world.goals.origin_cell[b].tolist()
             # Where the robot or a box had strayed into the other's cell, there is no such level.
-            with contextlib.suppress(LevelError):
+            with suppress(LevelError):
                 self._failed_at.append(replace(spec, level=replace(spec.level, boxes=boxes, player=(y, x))))
 
     def _next_episode(self) -> EpisodeSpec:

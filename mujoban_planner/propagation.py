@@ -30,11 +30,13 @@ _OPPOSITE: Final = [2, 3, 0, 1]
 
 def shifted(board: Tensor) -> Tensor:
     """Return what each cell's neighbour holds in each direction, [..., D, I, I] from [..., I, I]; 0 outside."""
-    size = board.shape[-1]
-    padded = functional.pad(board, (1, 1, 1, 1))
-    return torch.stack(
-        [padded[..., 1 + row : 1 + row + size, 1 + column : 1 + column + size] for row, column in _DIRECTIONS], -3
-    )
+    return torch.stack(_neighbours(functional.pad(board, (1, 1, 1, 1))), -3)
+
+
+def _neighbours(padded: Tensor) -> list[Tensor]:
+    """Return views of a board padded by one, [..., I + 2, I + 2], shifted in each direction, D of [..., I, I]."""
+    size = padded.shape[-1] - 2
+    return [padded[..., 1 + row : 1 + row + size, 1 + column : 1 + column + size] for row, column in _DIRECTIONS]
 
 
 def propagate(planes: Tensor) -> Tensor:
@@ -97,12 +99,8 @@ def _spread(value: Tensor, mask: Tensor, decay: Tensor) -> Tensor:
 
     Works in place on a padded board, since the cost of one decision is that of its many small operations.
     """
-    size = value.shape[-1]
     board = functional.pad(value, (1, 1, 1, 1))
-    here = board[..., 1:-1, 1:-1]
-    neighbours = [
-        board[..., 1 + row : 1 + row + size, 1 + column : 1 + column + size] for row, column in _DIRECTIONS
-    ]
+    here, neighbours = board[..., 1:-1, 1:-1], _neighbours(board)
     limits = [limit.contiguous() for limit in mask.unbind(2)]
     for _ in range(ITERATIONS):
         north, east, south, west = (torch.minimum(*pair) for pair in zip(limits, neighbours, strict=True))
