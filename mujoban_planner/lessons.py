@@ -22,7 +22,7 @@ from mujoban_planner import load
 from mujoban_planner.boards import take_levels
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import Game, play
-from mujoban_planner.samples import Samples, concatenate
+from mujoban_planner.samples import Samples, concatenate, make_batch
 from mujoban_planner.teacher import Teacher, label_deadly, possible_pushes
 from mujoban_rl.weights import WeightsError
 from mujoban_sim.generator import TRAIN_SEEDS, generate_batch
@@ -36,6 +36,12 @@ _VISITS: Final = 4
 """States of each game from which the way is shown."""
 _KEPT: Final = 5
 """States kept of each such way."""
+_EASY_SHARE: Final = 0.25
+"""Share that is kept of the states of such ways in which the planner has nothing to learn; most are."""
+_TOLERANCE: Final = 0.1
+"""Distance of a verdict, a probability, from the truth from which on there is something to learn."""
+_FORWARD: Final = 1024
+"""States in one forward pass."""
 _SEEDS_PER_STREAM: Final = 10**12
 
 
@@ -90,15 +96,17 @@ class LessonMaker:
             game = play(
                 planner, levels, limit=_PLAY_LIMIT, exploration=exploration, rng=self._rng, reduced_precision=True
             )
-            parts.extend(self._correct(levels, game))
+            lost, on_its_way = self._correct(levels, game)
+            parts += [*lost, self._prioritise(planner, concatenate(on_its_way))]
         return concatenate(parts)
 
-    def _correct(self, levels: LevelBatch, game: Game) -> list[Samples]:
+    def _correct(self, levels: LevelBatch, game: Game) -> tuple[list[Samples], list[Samples]]:
+        """Return samples of where levels were lost, and of states anywhere on the way of all."""
         batch = np.arange(len(game.moves))
         length = np.where(game.solved, game.moves, _PLAY_LIMIT)
         first_dead = self._first_dead(levels, game)
         lost = first_dead > 0
-        parts = []
+        parts, on_its_way = [], []
         # Where it went wrong: the state before, what killed it, and a dead state.
         rows = batch[lost]
         if rows.size:
@@ -111,8 +119,12 @@ class LessonMaker:
         alive_until = np.where(lost, np.maximum(first_dead - 1, 1), length)
         for _ in range(_VISITS):
             somewhere = _states(levels, game, batch, self._rng.integers(0, alive_until))
-            parts.append(self._teacher.demonstrate(somewhere, self._rng, judged=self._judged, keep=_KEPT))
-        return parts
+            on_its_way.append(self._teacher.demonstrate(somewhere, self._rng, judged=self._judged, keep=_KEPT))
+        return parts, on_its_way
+
+    def _prioritise(self, planner: LearnedPlanner, samples: Samples) -> Samples:
+        """Return the samples on which the planner errs, and a share of the others."""
+        return samples.take(errs(planner, samples) | (self._rng.random(len(samples.agent)) < _EASY_SHARE))
 
     def _first_dead(self, levels: LevelBatch, game: Game) -> NDArray[np.int64]:
         """Return the first time at which the solver proves each level lost, [B]; -1 where it was never lost."""
@@ -129,6 +141,28 @@ class LessonMaker:
         first = np.full(len(batch), -1)
         first[lost] = dead[lost]
         return first
+
+
+@torch.no_grad()
+def errs(planner: LearnedPlanner, samples: Samples) -> NDArray[np.bool_]:
+    """Return where a planner prefers a wrong instruction, or misjudges an instruction or a push, bool [S].
+
+    Prioritised sampling in the sense of Schaul et al. (2016), with a threshold for a priority.
+    """
+    n = len(samples.agent)
+    found = np.zeros(n, np.bool_)
+    for rows in np.split(np.arange(n), range(_FORWARD, n, _FORWARD)) if n else ():
+        batch = make_batch(samples.take(rows), np.zeros(len(rows), np.int64))
+        with torch.autocast("cpu", torch.bfloat16):
+            output = planner(batch.state)
+        wrong = batch.right.any(1) & ~batch.right.gather(1, output.policy.argmax(1, keepdim=True))[:, 0]
+        off = (torch.sigmoid(output.dead.float()) - batch.dead.float()).abs() > _TOLERANCE
+        wrong |= (off & batch.dead_known).any(1)
+        if output.push_dead is not None:
+            off = (torch.sigmoid(output.push_dead.float()) - batch.push_dead.float()).abs() > _TOLERANCE
+            wrong |= (off & batch.push_known).flatten(1).any(1)
+        found[rows] = wrong.numpy()
+    return found
 
 
 def _states(levels: LevelBatch, game: Game, rows: NDArray[np.int64], times: NDArray[np.int64]) -> LevelBatch:

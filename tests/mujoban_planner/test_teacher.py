@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import torch
 
+from mujoban_planner import load
 from mujoban_planner.boards import abstract_states, bit_boards, likeliest_boards, state_tensor, take_levels
-from mujoban_planner.lessons import LessonMaker
+from mujoban_planner.lessons import LessonMaker, errs
 from mujoban_planner.planner import ResidualPlanner, input_planes
 from mujoban_planner.propagation import legal_pushes, propagate, walk_to_push
 from mujoban_planner.samples import SampleBuffer, make_batch, unlabelled
@@ -144,6 +145,17 @@ def test_corrections_show_the_way_from_where_an_untrained_planner_went_wrong():
     samples = LessonMaker(3, {5: 1.0}).corrections(ResidualPlanner(8, 1).eval(), n=6)
     deadly = (samples.dead != 0) & (samples.dead != 31)
     assert (samples.right != 0).any() and deadly.any()
+
+
+def test_planner_errs_where_the_truth_is_another_than_it_says():
+    samples = LessonMaker(4, {1: 1.0}).demonstrations(40)
+    planner = load()
+    assert errs(planner, samples).mean() < 0.2
+    false_verdicts = samples._replace(dead=samples.dead_known & ~samples.dead)
+    assert errs(planner, false_verdicts).mean() > 0.9
+    false_pushes = samples._replace(push_dead=samples.push_known & ~samples.push_dead)
+    assert errs(planner, false_pushes).mean() > 0.9
+    assert errs(planner, samples.take(np.zeros(0, np.int64))).shape == (0,)
 
 
 def test_buffer_keeps_the_newest_samples(samples):
