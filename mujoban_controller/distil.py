@@ -24,6 +24,7 @@ from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask, TaskStep
 from mujoban_controller.replay import SequenceReplay, memory_fields
 from mujoban_sim.goals import GoalKind
+from mujoban_sim.grid import Instruction
 from mujoban_sim.interfaces import Memory, renew_rows
 
 _KINDS = len(GoalKind) - 1
@@ -56,6 +57,9 @@ class DistilConfig:
     clip: float = 5.0
     goal_weight: float = 0.5
     kind_weight: float = 0.05
+    infeasible_weight: float = 1.0
+    """Weight of the torques under an instruction towards a wall or a blocked box. Below 1, a student in doubt whether
+    a push is possible tries it: the loss is nearly absolute, so it acts from this share of the odds on."""
     jitter: float = 0.25
     """Largest relative change of each colour's brightness, drawn anew for each sequence."""
     average: float = 0.998
@@ -80,7 +84,9 @@ def imitation_loss(
     """Return loss and statistics of a batch of sequences [M, T]."""
     mean, scale = output.action
     label = batch["label"]
-    action = functional.smooth_l1_loss(mean, label, beta=0.1)
+    blocked = (batch["kind"] == GoalKind.HOLD) & (batch["instruction"] != Instruction.STAY)
+    weight = torch.where(blocked, config.infeasible_weight, 1.0)[..., None]
+    action = (weight * functional.smooth_l1_loss(mean, label, beta=0.1, reduction="none")).mean()
     # The scale learns how far the teacher's torques stray from the mean, and does not move the mean.
     spread = -torch.distributions.Normal(mean.detach(), scale).log_prob(label).clamp(-10.0, 3.0).mean()
     offsets, logits = head(output.features)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, TrainingRun, training_episodes
 from mujoban_rl.training import RunError
 from mujoban_sim.generator import TRAIN_SEEDS
+from mujoban_sim.goals import GoalKind
+from mujoban_sim.grid import Instruction
 
 TASK = GoalTaskConfig(batch=4, difficulty=1)
 NETWORK = NetworkConfig(channels=(4, 8, 8), features=16, hidden=8)
@@ -92,6 +95,24 @@ def test_imitation_prefers_the_teachers_torque():
         optimiser.step()
     assert float(stats["error/torque"]) < 0.05
     assert float(output.action.scale.detach().max()) < 0.5
+
+
+def test_torques_of_blocked_instructions_weigh_as_configured():
+    config = replace(DISTIL, infeasible_weight=0.25)
+    controller = VisuomotorController(channels=(4, 8, 8), features=16, hidden=8)
+    batch = {"goal": torch.zeros(1, 1, 4), "label": torch.full((1, 1, 2), 0.7)}
+    output = controller(
+        torch.zeros(1, 1, 64, 64, 3, dtype=torch.uint8), torch.zeros(1, 1, controller.proprio_size),
+        torch.zeros(1, 1, dtype=torch.int64), torch.zeros(1, 1, dtype=torch.bool), controller.initial_memory(1),
+    )  # fmt: skip
+
+    def action_loss(kind: GoalKind, instruction: Instruction) -> float:
+        batch["kind"], batch["instruction"] = torch.tensor([[kind]]), torch.tensor([[instruction]])
+        return float(imitation_loss(output, GoalHead(24), batch, config)[1]["loss/action"])
+
+    full = action_loss(GoalKind.PUSH, Instruction.NORTH)
+    assert action_loss(GoalKind.HOLD, Instruction.NORTH) == pytest.approx(0.25 * full)
+    assert action_loss(GoalKind.HOLD, Instruction.STAY) == pytest.approx(full)
 
 
 def test_a_teacher_without_distillation_is_refused():
