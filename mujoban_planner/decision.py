@@ -1,15 +1,16 @@
 """What a planner remembers of an episode, so that it never repeats itself for ever.
 
 A failed instruction leaves the state as it was, and a greedy policy would repeat it; a cycle of states likewise.
-Each instruction is therefore made less attractive the more often it was tried in the same state. Estimates may
-flicker, so the robot's cell alone counts as well, more weakly.
+A push is therefore wanted less the more often it was tried with the boxes where they are, and less if it brings them
+back to where they were, so that the robot walks to another one; and each instruction is less attractive the more often
+it was tried in the same state. Estimates may flicker, so the robot's cell alone counts as well, more weakly.
 
-Shapes: M episodes, H = `HISTORY` decisions, A = 5 instructions.
+Shapes: M episodes, H = `HISTORY` decisions, A = 5 instructions, D = 4 directions, N = `grid.GRID_SIZE`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +19,27 @@ from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, Instruction
 
 HISTORY = 256
 """Decisions remembered; an episode has at most 240 s, some 120 moves."""
-STATE_WEIGHT = 3.0
-"""Log-probability lost per earlier try of the instruction in the same state."""
+PUSH_WEIGHT: Final = np.float32(3.0)
+"""Log-probability lost per earlier try of the push with the boxes where they are."""
+RETURN_WEIGHT: Final = np.float32(6.0)
+"""Log-probability that a push loses which brings the boxes back to where they were before: a tabu, with exceptions."""
+STATE_WEIGHT = 1.0
+"""Log-probability lost per earlier try of the instruction in the same state. Small, because ways to several pushes
+lead through the same states."""
 ARRIVAL_WEIGHT = 1.5
 """Log-probability lost per try since the robot came to this cell."""
-CELL_WEIGHT = 0.3
+CELL_WEIGHT = 0.1
 """Log-probability lost per earlier try in the same cell beyond `CELL_PATIENCE`."""
 CELL_PATIENCE = 6
+STAY_WEIGHT = 3.0
+"""Log-probability that STAY loses per earlier STAY in the same cell. Standing still changes nothing: a second time it
+is worth no more than any move."""
 
 _MIX = np.random.default_rng(0).integers(1, 2**62, size=(2, GRID_SIZE * GRID_SIZE), dtype=np.int64)
 """Zobrist keys of the agent's and the boxes' cells."""
+_CELLS = GRID_SIZE * GRID_SIZE
+_STEPS = OFFSETS_RC[1:] @ (GRID_SIZE, 1)
+"""What each direction adds to a flat cell, [D]."""
 
 
 class VisitMemory(NamedTuple):
@@ -44,7 +56,7 @@ class VisitMemory(NamedTuple):
 
 
 class VisitCounts(NamedTuple):
-    """How often each instruction was tried, [M, A] each."""
+    """How often each instruction was tried, [M, A] each, and each push."""
 
     state: NDArray[np.int64]
     """In the same state."""
@@ -52,6 +64,10 @@ class VisitCounts(NamedTuple):
     """In the same cell."""
     since_arrival: NDArray[np.int64]
     """Since the robot came to this cell."""
+    pushes: NDArray[np.float32]
+    """Of the box in each cell in each direction, with all boxes where they are now, [M, D, N, N]."""
+    returns: NDArray[np.bool_]
+    """Whether such a push would bring the boxes back to where they were in an earlier decision, [M, D, N, N]."""
 
 
 def initial_visits(batch: int) -> VisitMemory:
@@ -81,15 +97,46 @@ def count_visits(abstract_state: NDArray[np.float32], visits: VisitMemory) -> Vi
     back = (visits.count[:, None] - 1 - np.arange(HISTORY)) % HISTORY  # Shape [M, H]
     recent = np.take_along_axis(here, back[:, :, None], axis=1)
     staying = np.cumprod(recent.any(2), axis=1).astype(np.bool_)
-    return VisitCounts(same.sum(1), here.sum(1), (recent & staying[:, :, None]).sum(1))
+    since_arrival = (recent & staying[:, :, None]).sum(1)
+    is_box = abstract_state[..., BOX].reshape(len(cell), -1) > 0.5
+    boxes, known = key ^ _MIX[0][cell], visits.cells >= 0
+    before = visits.keys ^ _MIX[0][visits.cells]
+    tried = _tried_pushes(is_box, known & (before == boxes[:, None]), visits)
+    return VisitCounts(same.sum(1), here.sum(1), since_arrival, tried, _returning_pushes(is_box, boxes, before, known))
+
+
+def _tried_pushes(is_box: NDArray[np.bool_], same: NDArray[np.bool_], visits: VisitMemory) -> NDArray[np.float32]:
+    """Return `VisitCounts.pushes`: the moves towards a box, [M, N * N], of the decisions `same`, [M, H]."""
+    row, when = np.nonzero(same & (visits.moves != Instruction.STAY))
+    direction = visits.moves[row, when] - 1
+    ahead = (visits.cells[row, when] + _STEPS[direction]) % _CELLS
+    pushed = is_box[row, ahead]
+    counts = np.zeros((len(is_box), len(_STEPS), _CELLS), np.float32)
+    np.add.at(counts, (row[pushed], direction[pushed], ahead[pushed]), 1.0)
+    return counts.reshape(-1, len(_STEPS), GRID_SIZE, GRID_SIZE)
+
+
+def _returning_pushes(
+    is_box: NDArray[np.bool_], boxes: NDArray[np.int64], before: NDArray[np.int64], known: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return `VisitCounts.returns` from the boxes' hash now, [M], and in each decision, [M, H], where there was one."""
+    row, cell = np.nonzero(is_box)
+    after = boxes[row, None] ^ _MIX[1][cell, None] ^ _MIX[1][(cell[:, None] + _STEPS) % _CELLS]  # Shape [X, D]
+    returns = np.zeros((len(is_box), len(_STEPS), _CELLS), np.bool_)
+    returns[row, :, cell] = ((after[:, :, None] == before[row, None]) & known[row, None]).any(2)
+    return returns.reshape(-1, len(_STEPS), GRID_SIZE, GRID_SIZE)
+
+
+def push_penalty(counts: VisitCounts) -> NDArray[np.float32]:
+    """Return what is taken off the log-probability of each push that is wanted, [M, D, N, N]."""
+    return PUSH_WEIGHT * counts.pushes + RETURN_WEIGHT * counts.returns
 
 
 def visit_penalty(counts: VisitCounts) -> NDArray[np.float64]:
     """Return what is taken off each instruction's log-probability, [M, A]."""
     penalty = STATE_WEIGHT * counts.state + ARRIVAL_WEIGHT * counts.since_arrival
     penalty = penalty + CELL_WEIGHT * np.maximum(counts.cell - CELL_PATIENCE, 0)
-    # Standing still changes nothing: a second time it is worth no more than any move.
-    penalty[:, Instruction.STAY] += STATE_WEIGHT * counts.cell[:, Instruction.STAY]
+    penalty[:, Instruction.STAY] += STAY_WEIGHT * counts.cell[:, Instruction.STAY]
     return penalty
 
 

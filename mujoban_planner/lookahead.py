@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mujoban_planner.abstract_env import MOVE_LIMIT, AbstractEnvironment
 from mujoban_planner.boards import likeliest_boards, state_tensor
-from mujoban_planner.decision import VisitMemory, count_visits, initial_visits, remember, state_keys, visit_penalty
+from mujoban_planner.decision import VisitCounts, VisitMemory, count_visits, initial_visits, remember, state_keys
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state
 from mujoban_planner.search import search
 from mujoban_sim.interfaces import Memory, Planner
@@ -63,9 +63,8 @@ class LookAheadPlanner(Planner):
         alone = (planned == 0) | stuck
         decision = planned.copy()
         if alone.any():
-            scores = self.planner.scores(abstract_state[alone])
-            penalty = visit_penalty(counts)[alone]
-            decision[alone] = np.argmax(scores - penalty, axis=1)
+            scores = self.planner.scores(abstract_state[alone], VisitCounts._make(x[alone] for x in counts))
+            decision[alone] = np.argmax(scores, axis=1)
             plan[alone] = 0
         visits = remember(abstract_state, decision, visits)
         cursor = np.where(alone, 0, cursor + 1)

@@ -21,9 +21,17 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_planner.decision import VisitMemory, count_visits, initial_visits, remember, visit_penalty
+from mujoban_planner.decision import (
+    VisitCounts,
+    VisitMemory,
+    count_visits,
+    initial_visits,
+    push_penalty,
+    remember,
+    visit_penalty,
+)
 from mujoban_planner.propagation import PLANES, legal_pushes, propagate, walk_to_push
-from mujoban_planner.symmetry import SYMMETRIES, instruction_permutation, transform_planes
+from mujoban_planner.symmetry import SYMMETRIES, instruction_permutation, transform_planes, transform_pushes
 from mujoban_sim.grid import AGENT, CHANNELS, GRID_SIZE, Instruction
 from mujoban_sim.interfaces import Memory, Planner
 
@@ -84,16 +92,19 @@ class LearnedPlanner(nn.Module, Planner):
     def heads(self) -> PlannerHeads:
         """The read-out."""
 
-    def forward(self, abstract_state: Tensor, caution: float = 1.0) -> PlannerOutput:
+    def forward(
+        self, abstract_state: Tensor, caution: float = 1.0, reluctance: Tensor | None = None
+    ) -> PlannerOutput:
         """Return the heads' outputs for abstract states, float [B, N, N, 4] with values in [0, 1].
 
-        With another `caution` than 1, the policy's logits weigh the verdicts on pushes otherwise than in training.
+        With another `caution` than 1, the policy's logits weigh the verdicts on pushes otherwise than in training; with
+        `reluctance`, [B, D, I, I], that is taken off the log-probability of each push that the policy may walk to.
         """
         planes = input_planes(abstract_state)
         spread = propagate(planes) if self.propagation else None
         inputs = planes if spread is None else torch.cat([planes, spread], 1)
         features = self.features(inputs.contiguous(memory_format=torch.channels_last))
-        return self.heads(features, planes, None if spread is None else spread[:, 0], caution)
+        return self.heads(features, planes, None if spread is None else spread[:, 0], caution, reluctance)
 
     @property
     def inputs(self) -> int:
@@ -112,21 +123,22 @@ class LearnedPlanner(nn.Module, Planner):
         """
         check_abstract_state(abstract_state)
         visits = VisitMemory(*memory)
-        scores = self.scores(abstract_state)
-        decision = np.argmax(scores - visit_penalty(count_visits(abstract_state, visits)), axis=1)
+        scores = self.scores(abstract_state, count_visits(abstract_state, visits))
+        decision = np.argmax(scores, axis=1)
         return decision, tuple(remember(abstract_state, decision, visits))
 
     @torch.inference_mode()
-    def scores(self, abstract_state: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Return log pi(A | s) + caution * log(1 - p(dead | s, A)), [M, A], before what was tried counts."""
+    def scores(self, abstract_state: NDArray[np.float32], counts: VisitCounts) -> NDArray[np.float64]:
+        """Return log pi(A | s) + caution * log(1 - p(dead | s, A)), less what was tried before, [M, A]."""
         device = next(self.parameters()).device
         states = torch.from_numpy(np.ascontiguousarray(abstract_state, np.float32)).to(device)
-        log_policy, log_alive = self.evaluate(states)
-        return (log_policy + self.caution * log_alive).double().cpu().numpy()
+        reluctance = torch.from_numpy(push_penalty(counts)[..., 1:-1, 1:-1]).to(device)
+        log_policy, log_alive = self.evaluate(states, reluctance)
+        return (log_policy + self.caution * log_alive).double().cpu().numpy() - visit_penalty(counts)
 
-    def evaluate(self, states: Tensor) -> tuple[Tensor, Tensor]:
+    def evaluate(self, states: Tensor, reluctance: Tensor) -> tuple[Tensor, Tensor]:
         """Return log pi(A | s) and log(1 - p(dead | s, A)), both [B, A], with the thinking time that is set."""
-        output = self(states, self.caution)
+        output = self(states, self.caution, reluctance)
         return functional.log_softmax(output.policy, 1), functional.logsigmoid(-output.dead)
 
 
@@ -174,7 +186,12 @@ class PlannerHeads(nn.Module):
         ) if judge and propagation else None
 
     def forward(
-        self, features: Tensor, planes: Tensor, reachable: Tensor | None, caution: float = 1.0
+        self,
+        features: Tensor,
+        planes: Tensor,
+        reachable: Tensor | None,
+        caution: float = 1.0,
+        reluctance: Tensor | None = None,
     ) -> PlannerOutput:
         """Return the outputs.
 
@@ -183,6 +200,7 @@ class PlannerHeads(nn.Module):
             planes: (floor, target, agent, box), [B, 4, I, I].
             reachable: Where the robot can walk, [B, I, I]; None without propagation.
             caution: Weight of log(1 - p(dead)) beside the log-probability of a push.
+            reluctance: What is taken off the log-probability of each push, [B, D, I, I].
         """
         features = functional.relu(features)
         here = (features * planes[:, AGENT : AGENT + 1]).sum((2, 3))  # Shape [B, C]
@@ -193,11 +211,11 @@ class PlannerHeads(nn.Module):
             push = push + (legal_pushes(planes, reachable) + 1e-4).log()
         push = push - push.logsumexp((1, 2, 3), keepdim=True)
         dead, push_dead = self.dead(hidden).float(), None
-        wanted = push.detach()
+        wanted = push.detach() if reluctance is None else push.detach() - reluctance
         if self.push_dead is not None:
             push_dead = self.push_dead(features).float()
             wanted = wanted + caution * functional.logsigmoid(-push_dead.detach())
-            wanted = wanted - wanted.amax((1, 2, 3), keepdim=True)
+        wanted = wanted - wanted.amax((1, 2, 3), keepdim=True)
         if self.walk is not None:
             towards, start = walk_to_push(wanted.exp(), planes)
             guide = self.walk[0] * towards + self.walk[1] * start
@@ -264,12 +282,13 @@ class ResidualPlanner(LearnedPlanner):
         """Return features [B, C, I, I] of planes [B, `inputs`, I, I]."""
         return self.blocks(self.encoder(planes))
 
-    def evaluate(self, states: Tensor) -> tuple[Tensor, Tensor]:
+    def evaluate(self, states: Tensor, reluctance: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean log pi and log(1 - p(dead)), [B, A], over `thinking` (at most 8) symmetric views."""
         views = min(max(self.thinking, 1), SYMMETRIES)
         batch = len(states)
         seen = torch.cat([transform_planes(states, s) for s in range(views)])
-        parts = [x.unflatten(0, (views, batch)) for x in super().evaluate(seen)]  # Shape [views, B, A]
+        reluctance = torch.cat([transform_pushes(reluctance, s) for s in range(views)])
+        parts = [x.unflatten(0, (views, batch)) for x in super().evaluate(seen, reluctance)]  # Shape [views, B, A]
         order = torch.stack([instruction_permutation(s, states.device) for s in range(views)])
         log_policy, log_alive = (x.gather(2, order[:, None].expand_as(x)).mean(0) for x in parts)
         return log_policy, log_alive

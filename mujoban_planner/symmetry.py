@@ -29,6 +29,15 @@ def transform_planes(states: Tensor, symmetry: int) -> Tensor:
     return turned.flip(2) if symmetry >= 4 else turned
 
 
+def transform_pushes(pushes: Tensor, symmetry: int) -> Tensor:
+    """Return values of the push of each cell's box in each direction, [B, D, I, I], transformed."""
+    turned = torch.rot90(pushes, symmetry % 4, (2, 3))
+    turned = turned.flip(3) if symmetry >= 4 else turned
+    # Direction d of the transformed board was direction `source[d]` of the original one.
+    source = np.argsort(instruction_map(symmetry))[1:] - 1
+    return turned[:, source.tolist()]
+
+
 @lru_cache
 def instruction_map(symmetry: int) -> tuple[int, ...]:
     """Return, for each instruction on the original board, the instruction on the transformed one."""

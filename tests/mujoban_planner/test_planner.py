@@ -4,14 +4,22 @@ import torch
 
 import mujoban_planner
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.decision import HISTORY
-from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner, ResidualPlanner
+from mujoban_planner.decision import HISTORY, count_visits, initial_visits, remember
+from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner, ResidualPlanner, input_planes
 from mujoban_planner.play import play
-from mujoban_planner.symmetry import SYMMETRIES, instruction_map, instruction_permutation, transform_planes
+from mujoban_planner.propagation import legal_pushes
+from mujoban_planner.symmetry import (
+    SYMMETRIES,
+    instruction_map,
+    instruction_permutation,
+    transform_planes,
+    transform_pushes,
+)
 from mujoban_planner.validation import NetworkConfig
 from mujoban_sim.generator import generate_batch
 from mujoban_sim.grid import GRID_SIZE, Instruction
 from mujoban_sim.interfaces import take_rows
+from mujoban_sim.levels import Level, stack_levels
 
 
 class Stubborn(LearnedPlanner):
@@ -19,15 +27,15 @@ class Stubborn(LearnedPlanner):
 
     def __init__(self, preference=(0.0, 9.0, 3.0, 2.0, 1.0)):
         super().__init__(propagation=False)
-        self.preference = np.array(preference)
+        self.preference = torch.nn.Parameter(torch.tensor(preference))
 
     config = heads = property(lambda self: {})
 
     def features(self, planes):
         raise NotImplementedError
 
-    def scores(self, abstract_state):
-        return np.tile(self.preference - np.log(np.exp(self.preference).sum()), (len(abstract_state), 1))
+    def evaluate(self, states, reluctance):
+        return self.preference.log_softmax(0).expand(len(states), -1), torch.zeros(len(states), 5)
 
 
 def _states(n=4, difficulty=5, seed=0):
@@ -167,22 +175,72 @@ def test_shipped_planner_solves_easy_levels():
     assert game.solved.sum() >= 98
 
 
+def test_tried_pushes_count_as_long_as_the_boxes_are_where_they_were():
+    state = _states(1)
+    state[..., 2:] = 0.0
+    state[0, 5, 4, 2] = state[0, 4, 4, 3] = state[0, 7, 7, 3] = 1.0  # robot, boxes
+    visits = remember(state, np.array([Instruction.NORTH]), initial_visits(1))
+    visits = remember(state, np.array([Instruction.EAST]), visits)
+    pushes = count_visits(state, visits).pushes
+    assert pushes.sum() == 1 and pushes[0, Instruction.NORTH - 1, 4, 4] == 1
+    elsewhere = state.copy()
+    elsewhere[0, 5, 4, 2], elsewhere[0, 6, 4, 2] = 0.0, 1.0  # the robot
+    assert np.array_equal(count_visits(elsewhere, visits).pushes, pushes)
+    elsewhere[0, 7, 7, 3], elsewhere[0, 7, 6, 3] = 0.0, 1.0  # a box
+    assert not count_visits(elsewhere, visits).pushes.any()
+
+
+def test_a_push_that_undoes_another_is_known_as_such():
+    before = _states(1)
+    before[..., 2:] = 0.0
+    before[0, 5, 3, 2] = before[0, 5, 4, 3] = before[0, 2, 2, 3] = 1.0  # robot, boxes
+    after = before.copy()
+    after[0, 5, 3:6, 2:] = [[0, 0], [1, 0], [0, 1]]
+    visits = remember(before, np.array([Instruction.EAST]), initial_visits(1))
+    returns = count_visits(after, visits).returns
+    assert returns.sum() == 1 and returns[0, Instruction.WEST - 1, 5, 5]
+
+
+def test_robot_walks_to_another_push_when_one_was_tried():
+    rock = "#" * GRID_SIZE + "\n"
+    level = Level.from_text(4 * rock + "#. $@ $ .#\n" + 5 * rock)
+    states = torch.from_numpy(abstract_states(stack_levels([level])))
+    planner = ResidualPlanner(8, 1).eval()
+
+    def eagerness(reluctant: Instruction) -> float:
+        reluctance = torch.zeros(1, 4, 8, 8)
+        reluctance[:, reluctant - 1] = 15.0
+        policy = planner(states, 1.0, reluctance).policy[0].detach()
+        return (policy[Instruction.EAST] - policy[Instruction.WEST]).item()
+
+    assert eagerness(Instruction.WEST) > eagerness(Instruction.EAST) + 2.0
+
+
+def test_pushes_turn_with_the_board():
+    states = torch.from_numpy(_states(1))
+    pushes = legal_pushes(input_planes(states), torch.ones(1, 8, 8))
+    for symmetry in range(SYMMETRIES):
+        turned = input_planes(transform_planes(states, symmetry))
+        assert torch.equal(transform_pushes(pushes, symmetry), legal_pushes(turned, torch.ones(1, 8, 8)))
+
+
 def test_decisions_average_two_views_by_default_and_training_takes_one():
     planner, states = ResidualPlanner(16, 2).eval(), _states(4)
-    averaged = planner.scores(states)
+    untried = count_visits(states, initial_visits(4))
+    averaged = planner.scores(states, untried)
     planner.thinking = 2
-    assert np.array_equal(averaged, planner.scores(states))
+    assert np.array_equal(averaged, planner.scores(states, untried))
     planner.thinking = 1
-    assert not np.allclose(averaged, planner.scores(states))
+    assert not np.allclose(averaged, planner.scores(states, untried))
     assert NetworkConfig().build().thinking == 1
 
 
 def test_soft_views_average_to_a_symmetric_policy():
     planner = ResidualPlanner(16, 2).eval()
     planner.thinking = 8
-    states = torch.from_numpy(_states(2))
+    states, tried = torch.from_numpy(_states(2)), torch.rand(2, 4, 8, 8)
     with torch.inference_mode():
-        upright, _ = planner.evaluate(states)
-        turned, _ = planner.evaluate(transform_planes(states, 3))
+        upright, _ = planner.evaluate(states, tried)
+        turned, _ = planner.evaluate(transform_planes(states, 3), transform_pushes(tried, 3))
     order = instruction_permutation(3)
     assert torch.allclose(upright, turned[:, order], atol=1e-4)
