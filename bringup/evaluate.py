@@ -91,6 +91,9 @@ def main(command_line: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(command_line)
     import_from_here()
     episodes, stack = episodes_from(arguments), stack_from(arguments)
+    import torch
+
+    torch.set_num_threads(arguments.threads)
     if arguments.graph:
         from bringup.stack import PlayOptions, play
 
@@ -101,9 +104,6 @@ def main(command_line: Sequence[str] | None = None) -> int:
             )
         content = report(outcome.results, stack.identities(), ticks_per_second=outcome.ticks_per_second)
     else:
-        import torch
-
-        torch.set_num_threads(arguments.threads)
         results = evaluate(
             stack.policy(),
             episodes,

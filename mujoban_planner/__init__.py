@@ -24,8 +24,6 @@ def load(path: str | Path | None = None, device: str | torch.device = "cpu") -> 
     Raises:
         WeightsError: If the weights are missing, damaged, or of no known architecture.
     """
-    import torch
-
     from mujoban_planner.planner import ARCHITECTURES
     from mujoban_rl.weights import WeightsError, load_weights, read_record
 
@@ -33,9 +31,9 @@ def load(path: str | Path | None = None, device: str | torch.device = "cpu") -> 
     name = read_record(weights)["class"]
     if name not in ARCHITECTURES:
         raise WeightsError(f"{weights}: holds weights of {name}, expected one of {', '.join(ARCHITECTURES)}")
-    # Convolutions would rearrange their weights so in every call.
     planner = load_weights(ARCHITECTURES[name], weights, device)
-    return planner.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # missing in the stubs
+    planner.lay_out()
+    return planner
 
 
 __all__ = ["SHIPPED", "load"]

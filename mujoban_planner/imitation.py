@@ -133,7 +133,7 @@ class ImitationTrainer:
         self.network = config.build().to(self.device)
         if config.init is not None:
             start_from(self.network, Path(config.init))
-        _convolutions_channels_last(self.network)
+        self.network.lay_out()
         self.average = copy.deepcopy(self.network).eval()
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, (0.9, 0.98), weight_decay=config.weight_decay, fused=True
@@ -304,12 +304,3 @@ class ImitationTrainer:
             "demonstrations": float(self.demonstrations.added),
             "corrections": float(self.corrections.added),
         }
-
-
-def _convolutions_channels_last(network: nn.Module) -> None:
-    """Lay out convolution weights as channels-last, which bfloat16 convolutions on a CPU want."""
-    for module in network.modules():
-        if isinstance(module, nn.Conv2d):
-            module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-

@@ -111,6 +111,12 @@ class LearnedPlanner(nn.Module, Planner):
         """Number of input planes."""
         return len(CHANNELS) + (PLANES if self.propagation else 0)
 
+    def lay_out(self) -> None:
+        """Store convolutions' weights channels-last, as they would rearrange them in every call."""
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # not in the stubs
+
     def initial_memory(self, batch: int) -> Memory:
         """Return an empty record of visits for `batch` episodes."""
         return initial_visits(batch)

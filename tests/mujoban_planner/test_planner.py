@@ -16,6 +16,7 @@ from mujoban_planner.symmetry import (
     transform_pushes,
 )
 from mujoban_planner.validation import NetworkConfig
+from mujoban_rl.weights import save_weights
 from mujoban_sim.generator import generate_batch
 from mujoban_sim.grid import GRID_SIZE, Instruction
 from mujoban_sim.interfaces import take_rows
@@ -166,6 +167,15 @@ def test_symmetric_views_bring_instructions_back():
         values = torch.arange(5.0)[None]
         seen = torch.zeros(1, 5).scatter_(1, torch.tensor([names]), values)
         assert torch.equal(seen.gather(1, instruction_permutation(symmetry)[None]), values)
+
+
+@pytest.mark.parametrize("planner", [ResidualPlanner(16, 2), RecurrentPlanner(8, 2), RecurrentPlanner(8, 1, 1, True)])
+def test_saved_planners_load_again_and_decide_alike(planner, tmp_path):
+    save_weights(tmp_path / "planner.safetensors", planner, planner.config, {})
+    states = _states(6)
+    memory = planner.initial_state(np.arange(6)).memory
+    loaded = mujoban_planner.load(tmp_path / "planner.safetensors")
+    assert np.array_equal(loaded.decide(states, memory)[0], planner.eval().decide(states, memory)[0])
 
 
 def test_shipped_planner_solves_easy_levels():
