@@ -13,7 +13,7 @@ interior alone), C channels, A = 5 instructions, H decisions remembered.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,35 +30,16 @@ from mujoban_planner.decision import (
     remember,
     visit_penalty,
 )
-from mujoban_planner.propagation import PLANES, legal_pushes, propagate, walk_to_push
-from mujoban_planner.symmetry import SYMMETRIES, instruction_permutation, transform_planes, transform_pushes
-from mujoban_sim.grid import AGENT, CHANNELS, GRID_SIZE, Instruction
+from mujoban_planner.heads import INTERIOR, Advice, PlannerHeads, PlannerOutput, PoolAndInject, verdicts
+from mujoban_planner.propagation import PLANES, propagate
+from mujoban_planner.symmetry import SYMMETRIES, average_instructions, average_pushes, view_states
+from mujoban_sim.grid import CHANNELS, GRID_SIZE
 from mujoban_sim.interfaces import Memory, Planner
 
-INSTRUCTIONS = len(Instruction)
-INTERIOR = GRID_SIZE - 2
 CAUTION = 4.0
 """Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/planner.md)."""
 VIEWS = 2
 """Symmetric views of the board that a residual network averages over by default: what 5 ms on one core allow."""
-
-
-class PlannerOutput(NamedTuple):
-    """What a network says about abstract states."""
-
-    policy: Tensor
-    """Logits of the instructions, [B, A]."""
-    q: Tensor
-    """Q-value of each instruction in units of reward (paper C.2), [B, A]."""
-    dead: Tensor
-    """Logit of "no solution is left after this instruction", [B, A]; that of STAY judges the state itself."""
-    plan: Tensor
-    """Logits of the plan map, [B, A, I, I]: the direction in which a box will next be pushed out of each cell
-    (STAY: none)."""
-    push: Tensor
-    """Log-probability that the next push is that of the box in each cell in each direction, [B, 4, I, I]."""
-    push_dead: Tensor | None
-    """Logit of "no solution is left after this push", [B, 4, I, I]; None for a network that does not judge pushes."""
 
 
 class LearnedPlanner(nn.Module, Planner):
@@ -92,19 +73,20 @@ class LearnedPlanner(nn.Module, Planner):
     def heads(self) -> PlannerHeads:
         """The read-out."""
 
-    def forward(
-        self, abstract_state: Tensor, caution: float = 1.0, reluctance: Tensor | None = None
-    ) -> PlannerOutput:
-        """Return the heads' outputs for abstract states, float [B, N, N, 4] with values in [0, 1].
+    def forward(self, abstract_state: Tensor) -> PlannerOutput:
+        """Return the heads' outputs for abstract states, float [B, N, N, 4] with values in [0, 1]."""
+        output, planes = self.read(abstract_state)
+        # The policy follows the push head without teaching it.
+        wanted = (output.push + verdicts(output)).detach()
+        return output._replace(policy=output.policy + self.heads.guide(wanted, planes))
 
-        With another `caution` than 1, the policy's logits weigh the verdicts on pushes otherwise than in training; with
-        `reluctance`, [B, D, I, I], that is taken off the log-probability of each push that the policy may walk to.
-        """
+    def read(self, abstract_state: Tensor) -> tuple[PlannerOutput, Tensor]:
+        """Return the outputs before the way to a push counts, and the input planes, [B, 4, I, I]."""
         planes = input_planes(abstract_state)
         spread = propagate(planes) if self.propagation else None
         inputs = planes if spread is None else torch.cat([planes, spread], 1)
         features = self.features(inputs.contiguous(memory_format=torch.channels_last))
-        return self.heads(features, planes, None if spread is None else spread[:, 0], caution, reluctance)
+        return self.heads(features, planes, None if spread is None else spread[:, 0]), planes
 
     @property
     def inputs(self) -> int:
@@ -139,13 +121,16 @@ class LearnedPlanner(nn.Module, Planner):
         device = next(self.parameters()).device
         states = torch.from_numpy(np.ascontiguousarray(abstract_state, np.float32)).to(device)
         reluctance = torch.from_numpy(push_penalty(counts)[..., 1:-1, 1:-1]).to(device)
-        log_policy, log_alive = self.evaluate(states, reluctance)
-        return (log_policy + self.caution * log_alive).double().cpu().numpy() - visit_penalty(counts)
+        advice = self.advise(states)
+        wanted = advice.push + self.caution * advice.push_alive - reluctance
+        policy = advice.policy + self.heads.guide(wanted, input_planes(states))
+        score = functional.log_softmax(policy, 1) + self.caution * advice.alive
+        return score.double().cpu().numpy() - visit_penalty(counts)
 
-    def evaluate(self, states: Tensor, reluctance: Tensor) -> tuple[Tensor, Tensor]:
-        """Return log pi(A | s) and log(1 - p(dead | s, A)), both [B, A], with the thinking time that is set."""
-        output = self(states, self.caution, reluctance)
-        return functional.log_softmax(output.policy, 1), functional.logsigmoid(-output.dead)
+    def advise(self, states: Tensor) -> Advice:
+        """Return what a decision weighs in states [B, N, N, 4], with the thinking time that is set."""
+        output, _ = self.read(states)
+        return Advice(output.policy, functional.logsigmoid(-output.dead), output.push, verdicts(output))
 
 
 def check_abstract_state(abstract_state: NDArray[np.float32]) -> None:
@@ -164,82 +149,6 @@ def input_planes(abstract_state: Tensor) -> Tensor:
     """
     planes = abstract_state[:, 1:-1, 1:-1].permute(0, 3, 1, 2)
     return torch.cat([1.0 - planes[:, :1], planes[:, 1:]], 1)
-
-
-class PlannerHeads(nn.Module):
-    """Policy, Q, dead-state, plan-map and push heads, reading the features at the robot's cell and over the board."""
-
-    def __init__(
-        self, channels: int, *, propagation: bool, judge: bool, hidden: int = 128, squeeze: int = 32
-    ) -> None:
-        """Build heads over `channels` features; the board is squeezed to `squeeze` channels per cell.
-
-        With `propagation` the push head chooses among the legal pushes, and the policy reads from it, through a value
-        iteration over the board, which way leads there. With `judge` as well, each push is judged where the box is,
-        and what is judged deadly is not wanted.
-        """
-        super().__init__()
-        self.squeeze = nn.Conv2d(channels, squeeze, 1)
-        self.board = nn.Linear(squeeze * INTERIOR * INTERIOR + channels, hidden)
-        self.policy = nn.Linear(hidden, INSTRUCTIONS)
-        self.q = nn.Linear(hidden, INSTRUCTIONS)
-        self.dead = nn.Linear(hidden, INSTRUCTIONS)
-        self.plan = nn.Conv2d(channels, INSTRUCTIONS, 1)
-        self.push = nn.Conv2d(channels, INSTRUCTIONS - 1, 1)
-        self.walk = nn.Parameter(torch.tensor([4.0, 8.0])) if propagation else None
-        self.push_dead = nn.Sequential(
-            nn.Conv2d(channels, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, INSTRUCTIONS - 1, 1)
-        ) if judge and propagation else None
-
-    def forward(
-        self,
-        features: Tensor,
-        planes: Tensor,
-        reachable: Tensor | None,
-        caution: float = 1.0,
-        reluctance: Tensor | None = None,
-    ) -> PlannerOutput:
-        """Return the outputs.
-
-        Args:
-            features: [B, C, I, I].
-            planes: (floor, target, agent, box), [B, 4, I, I].
-            reachable: Where the robot can walk, [B, I, I]; None without propagation.
-            caution: Weight of log(1 - p(dead)) beside the log-probability of a push.
-            reluctance: What is taken off the log-probability of each push, [B, D, I, I].
-        """
-        features = functional.relu(features)
-        here = (features * planes[:, AGENT : AGENT + 1]).sum((2, 3))  # Shape [B, C]
-        board = functional.relu(self.squeeze(features)).flatten(1)
-        hidden = functional.relu(self.board(torch.cat([board, here], 1)))
-        policy, push = self.policy(hidden).float(), self.push(features).float()
-        if reachable is not None:
-            push = push + (legal_pushes(planes, reachable) + 1e-4).log()
-        push = push - push.logsumexp((1, 2, 3), keepdim=True)
-        dead, push_dead = self.dead(hidden).float(), None
-        wanted = push.detach() if reluctance is None else push.detach() - reluctance
-        if self.push_dead is not None:
-            push_dead = self.push_dead(features).float()
-            wanted = wanted + caution * functional.logsigmoid(-push_dead.detach())
-        wanted = wanted - wanted.amax((1, 2, 3), keepdim=True)
-        if self.walk is not None:
-            towards, start = walk_to_push(wanted.exp(), planes)
-            guide = self.walk[0] * towards + self.walk[1] * start
-            policy = policy + functional.pad(guide, (1, 0))
-        return PlannerOutput(policy, self.q(hidden).float(), dead, self.plan(features).float(), push, push_dead)
-
-
-class PoolAndInject(nn.Module):
-    """Mean and maximum over the board, mapped to a bias per channel (Guez et al. 2019)."""
-
-    def __init__(self, channels: int, outputs: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(2 * channels, outputs)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return [B, outputs, 1, 1] from [B, C, I, I]."""
-        pooled = torch.cat([x.mean((2, 3)), x.amax((2, 3))], 1)
-        return self.linear(pooled)[:, :, None, None]
 
 
 class ResidualBlock(nn.Module):
@@ -288,16 +197,18 @@ class ResidualPlanner(LearnedPlanner):
         """Return features [B, C, I, I] of planes [B, `inputs`, I, I]."""
         return self.blocks(self.encoder(planes))
 
-    def evaluate(self, states: Tensor, reluctance: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean log pi and log(1 - p(dead)), [B, A], over `thinking` (at most 8) symmetric views."""
+    def advise(self, states: Tensor) -> Advice:
+        """Return the mean advice over `thinking` (at most 8) symmetric views."""
         views = min(max(self.thinking, 1), SYMMETRIES)
-        batch = len(states)
-        seen = torch.cat([transform_planes(states, s) for s in range(views)])
-        reluctance = torch.cat([transform_pushes(reluctance, s) for s in range(views)])
-        parts = [x.unflatten(0, (views, batch)) for x in super().evaluate(seen, reluctance)]  # Shape [views, B, A]
-        order = torch.stack([instruction_permutation(s, states.device) for s in range(views)])
-        log_policy, log_alive = (x.gather(2, order[:, None].expand_as(x)).mean(0) for x in parts)
-        return log_policy, log_alive
+        if views == 1:
+            return super().advise(states)
+        policy, alive, push, push_alive = super().advise(view_states(states, views))
+        return Advice(
+            average_instructions(policy, views),
+            average_instructions(alive, views),
+            average_pushes(push, views),
+            average_pushes(push_alive, views),
+        )
 
 
 class ConvLSTMCell(nn.Module):

@@ -23,19 +23,45 @@ def transform_board(board: NDArray[np.generic], symmetry: int) -> NDArray[np.gen
     return turned[..., ::-1] if symmetry >= 4 else turned
 
 
-def transform_planes(states: Tensor, symmetry: int) -> Tensor:
-    """Return abstract states [B, N, N, 4], transformed."""
-    turned = torch.rot90(states, symmetry % 4, (1, 2))
-    return turned.flip(2) if symmetry >= 4 else turned
+def view_states(states: Tensor, views: int) -> Tensor:
+    """Return abstract states [B, N, N, 4] under symmetries 0 to `views` - 1, [views * B, N, N, 4]."""
+    size = states.shape[1]
+    seen = states.flatten(1, 2)[:, _view_sources(size, views).to(states.device)]  # Shape [B, views, N * N, 4]
+    return seen.transpose(0, 1).reshape(-1, size, size, states.shape[3])
 
 
-def transform_pushes(pushes: Tensor, symmetry: int) -> Tensor:
-    """Return values of the push of each cell's box in each direction, [B, D, I, I], transformed."""
-    turned = torch.rot90(pushes, symmetry % 4, (2, 3))
-    turned = turned.flip(3) if symmetry >= 4 else turned
-    # Direction d of the transformed board was direction `source[d]` of the original one.
-    source = np.argsort(instruction_map(symmetry))[1:] - 1
-    return turned[:, source.tolist()]
+def average_instructions(values: Tensor, views: int) -> Tensor:
+    """Return the mean over views, [B, A], of values of instructions in `view_states`, [views * B, A]."""
+    values = values.unflatten(0, (views, -1))
+    return values.take_along_dim(_instruction_images(views).to(values.device), 2).mean(0)
+
+
+def average_pushes(values: Tensor, views: int) -> Tensor:
+    """Return the mean over views, [B, D, I, I], of values of the push of each cell's box in each direction."""
+    directions, size = values.shape[1:3]
+    flat = values.reshape(views, -1, directions * size * size)
+    return flat.take_along_dim(_push_images(size, views).to(values.device), 2).mean(0).view(-1, directions, size, size)
+
+
+@lru_cache
+def _view_sources(size: int, views: int) -> Tensor:
+    """Return the flat cell from which each cell of each view comes, int64 [views, size * size]."""
+    return torch.from_numpy(cell_sources(size)[:views])
+
+
+@lru_cache
+def _instruction_images(views: int) -> Tensor:
+    """Return what each instruction is in each view, int64 [views, 1, A]."""
+    return torch.tensor([[instruction_map(s)] for s in range(views)])
+
+
+@lru_cache
+def _push_images(size: int, views: int) -> Tensor:
+    """Return where the push of each cell's box in each direction stands in each view, int64 [views, 1, D * size**2]."""
+    images = np.argsort(cell_sources(size)[:views], axis=1)  # Shape [views, size * size]
+    directions = np.array([instruction_map(s)[1:] for s in range(views)]) - 1  # Shape [views, D]
+    flat = directions[:, :, None] * size * size + images[:, None]
+    return torch.from_numpy(flat.reshape(views, 1, -1))
 
 
 @lru_cache
@@ -50,11 +76,6 @@ def instruction_map(symmetry: int) -> tuple[int, ...]:
         image = np.argwhere(transform_board(board, symmetry))[0] - 1
         images.append(int(np.flatnonzero((image == OFFSETS_RC).all(1))[0]))
     return tuple(images)
-
-
-def instruction_permutation(symmetry: int, device: torch.device | str = "cpu") -> Tensor:
-    """Return int64 [5] such that `values.gather(-1, permutation)` brings values back to the original board."""
-    return torch.tensor(instruction_map(symmetry), device=device)
 
 
 @lru_cache

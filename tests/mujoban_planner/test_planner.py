@@ -5,15 +5,16 @@ import torch
 import mujoban_planner
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.decision import HISTORY, count_visits, initial_visits, remember
+from mujoban_planner.heads import Advice, PlannerHeads
 from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner, ResidualPlanner, input_planes
 from mujoban_planner.play import play
 from mujoban_planner.propagation import legal_pushes
 from mujoban_planner.symmetry import (
     SYMMETRIES,
+    average_instructions,
+    average_pushes,
     instruction_map,
-    instruction_permutation,
-    transform_planes,
-    transform_pushes,
+    view_states,
 )
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.weights import save_weights
@@ -30,13 +31,16 @@ class Stubborn(LearnedPlanner):
         super().__init__(propagation=False)
         self.preference = torch.nn.Parameter(torch.tensor(preference))
 
-    config = heads = property(lambda self: {})
+    config = property(lambda self: {})
 
     def features(self, planes):
         raise NotImplementedError
 
-    def evaluate(self, states, reluctance):
-        return self.preference.log_softmax(0).expand(len(states), -1), torch.zeros(len(states), 5)
+    heads = PlannerHeads(1, propagation=False, judge=False)
+
+    def advise(self, states):
+        pushes = torch.zeros(len(states), 4, 8, 8)
+        return Advice(self.preference.expand(len(states), -1), torch.zeros(len(states), 5), pushes, pushes)
 
 
 def _states(n=4, difficulty=5, seed=0):
@@ -160,13 +164,13 @@ def test_symmetric_views_bring_instructions_back():
             moved = states.clone()
             moved[..., 2] = 0
             moved[0, where[0] + offset[0], where[1] + offset[1], 2] = 1
-            turned = torch.argwhere(transform_planes(moved, symmetry)[0, ..., 2])[0]
-            origin = torch.argwhere(transform_planes(states, symmetry)[0, ..., 2])[0]
+            turned = torch.argwhere(view_states(moved, SYMMETRIES)[symmetry, ..., 2])[0]
+            origin = torch.argwhere(view_states(states, SYMMETRIES)[symmetry, ..., 2])[0]
             step = [(0, 0), (-1, 0), (0, 1), (1, 0), (0, -1)][names[a]]
             assert (turned - origin).tolist() == list(step)
-        values = torch.arange(5.0)[None]
-        seen = torch.zeros(1, 5).scatter_(1, torch.tensor([names]), values)
-        assert torch.equal(seen.gather(1, instruction_permutation(symmetry)[None]), values)
+    values, seen = torch.arange(5.0), torch.zeros(SYMMETRIES, 5)
+    seen.scatter_(1, torch.tensor([instruction_map(s) for s in range(SYMMETRIES)]), values.expand(SYMMETRIES, -1))
+    assert torch.equal(average_instructions(seen, SYMMETRIES), values[None])
 
 
 @pytest.mark.parametrize("planner", [ResidualPlanner(16, 2), RecurrentPlanner(8, 2), RecurrentPlanner(8, 1, 1, True)])
@@ -214,24 +218,27 @@ def test_a_push_that_undoes_another_is_known_as_such():
 def test_robot_walks_to_another_push_when_one_was_tried():
     rock = "#" * GRID_SIZE + "\n"
     level = Level.from_text(4 * rock + "#. $@ $ .#\n" + 5 * rock)
-    states = torch.from_numpy(abstract_states(stack_levels([level])))
+    states = abstract_states(stack_levels([level]))
+    untried = count_visits(states, initial_visits(1))
     planner = ResidualPlanner(8, 1).eval()
 
-    def eagerness(reluctant: Instruction) -> float:
-        reluctance = torch.zeros(1, 4, 8, 8)
-        reluctance[:, reluctant - 1] = 15.0
-        policy = planner(states, 1.0, reluctance).policy[0].detach()
-        return (policy[Instruction.EAST] - policy[Instruction.WEST]).item()
+    def eagerness(tried: Instruction) -> float:
+        pushes = np.zeros((1, 4, GRID_SIZE, GRID_SIZE), np.float32)
+        pushes[:, tried - 1] = 5
+        scores = planner.scores(states, untried._replace(pushes=pushes))[0]
+        return scores[Instruction.EAST] - scores[Instruction.WEST]
 
     assert eagerness(Instruction.WEST) > eagerness(Instruction.EAST) + 2.0
 
 
-def test_pushes_turn_with_the_board():
-    states = torch.from_numpy(_states(1))
-    pushes = legal_pushes(input_planes(states), torch.ones(1, 8, 8))
-    for symmetry in range(SYMMETRIES):
-        turned = input_planes(transform_planes(states, symmetry))
-        assert torch.equal(transform_pushes(pushes, symmetry), legal_pushes(turned, torch.ones(1, 8, 8)))
+def test_symmetric_views_bring_pushes_back():
+    states = torch.from_numpy(_states(3))
+
+    def pushes(boards: torch.Tensor) -> torch.Tensor:
+        return legal_pushes(input_planes(boards), torch.ones(len(boards), 8, 8))
+
+    for views in range(1, SYMMETRIES + 1):
+        assert torch.equal(average_pushes(pushes(view_states(states, views)), views), pushes(states))
 
 
 def test_decisions_average_two_views_by_default_and_training_takes_one():
@@ -248,9 +255,8 @@ def test_decisions_average_two_views_by_default_and_training_takes_one():
 def test_soft_views_average_to_a_symmetric_policy():
     planner = ResidualPlanner(16, 2).eval()
     planner.thinking = 8
-    states, tried = torch.from_numpy(_states(2)), torch.rand(2, 4, 8, 8)
-    with torch.inference_mode():
-        upright, _ = planner.evaluate(states, tried)
-        turned, _ = planner.evaluate(transform_planes(states, 3), transform_pushes(tried, 3))
-    order = instruction_permutation(3)
-    assert torch.allclose(upright, turned[:, order], atol=1e-4)
+    states = _states(2)
+    turned = view_states(torch.from_numpy(states), SYMMETRIES).unflatten(0, (SYMMETRIES, -1))[3].numpy()
+    untried = count_visits(states, initial_visits(2))
+    upright, seen = planner.scores(states, untried), planner.scores(turned, untried)
+    assert np.allclose(upright, seen[:, instruction_map(3)], atol=1e-3)

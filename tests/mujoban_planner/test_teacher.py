@@ -8,7 +8,7 @@ from mujoban_planner.lessons import LessonMaker, errs
 from mujoban_planner.planner import ResidualPlanner, input_planes
 from mujoban_planner.propagation import legal_pushes, propagate, walk_to_push
 from mujoban_planner.samples import SampleBuffer, make_batch, unlabelled
-from mujoban_planner.symmetry import SYMMETRIES, transform_planes
+from mujoban_planner.symmetry import SYMMETRIES, view_states
 from mujoban_planner.teacher import DISCOUNT, Teacher, label_deadly
 from mujoban_sim import rules
 from mujoban_sim.generator import generate_batch
@@ -68,7 +68,7 @@ def test_labels_turn_with_the_board(samples):
         batch = make_batch(part, np.full(len(shown), symmetry))
         assert (batch.push_known.flatten(1).gather(1, batch.next_push[:, None])).all()
         assert not (batch.push_dead & ~batch.push_known).any()
-        assert torch.equal(batch.state, transform_planes(upright.state, symmetry))
+        assert torch.equal(batch.state, view_states(upright.state, SYMMETRIES).unflatten(0, (SYMMETRIES, -1))[symmetry])
         planes = input_planes(batch.state)
         legal = legal_pushes(planes, propagate(planes)[:, 0])
         assert (legal.flatten(1).gather(1, batch.next_push[:, None]) == 1).all()
