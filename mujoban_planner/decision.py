@@ -10,7 +10,7 @@ Shapes: M episodes, H = `HISTORY` decisions, A = 5 instructions, D = 4 direction
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,9 @@ from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, Instruction
 
 HISTORY = 256
 """Decisions remembered; an episode has at most 240 s, some 120 moves."""
-PUSH_WEIGHT: Final = np.float32(3.0)
+PUSH_WEIGHT = 3.0
 """Log-probability lost per earlier try of the push with the boxes where they are."""
-RETURN_WEIGHT: Final = np.float32(6.0)
+RETURN_WEIGHT = 6.0
 """Log-probability that a push loses which brings the boxes back to where they were before: a tabu, with exceptions."""
 STATE_WEIGHT = 1.0
 """Log-probability lost per earlier try of the instruction in the same state. Small, because ways to several pushes
@@ -35,9 +35,9 @@ STAY_WEIGHT = 3.0
 """Log-probability that STAY loses per earlier STAY in the same cell. Standing still changes nothing: a second time it
 is worth no more than any move."""
 
-_MIX = np.random.default_rng(0).integers(1, 2**62, size=(2, GRID_SIZE * GRID_SIZE), dtype=np.int64)
-"""Zobrist keys of the agent's and the boxes' cells."""
 _CELLS = GRID_SIZE * GRID_SIZE
+_MIX = np.random.default_rng(0).integers(1, 2**62, size=(2, _CELLS), dtype=np.int64)
+"""Zobrist keys of the agent's and the boxes' cells."""
 _STEPS = OFFSETS_RC[1:] @ (GRID_SIZE, 1)
 """What each direction adds to a flat cell, [D]."""
 
@@ -80,10 +80,14 @@ def initial_visits(batch: int) -> VisitMemory:
 
 def state_keys(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return a hash of (agent's likeliest cell, boxes likelier than not), [M], and that cell, [M]."""
-    flat = abstract_state.reshape(len(abstract_state), GRID_SIZE * GRID_SIZE, -1)
-    cell = flat[:, :, AGENT].argmax(1)
-    boxes = np.bitwise_xor.reduce(np.where(flat[:, :, BOX] > 0.5, _MIX[1], 0), axis=1)
+    cell = abstract_state[..., AGENT].reshape(-1, _CELLS).argmax(1)
+    boxes = np.bitwise_xor.reduce(np.where(_likely_boxes(abstract_state), _MIX[1], 0), axis=1)
     return boxes ^ _MIX[0][cell], cell.astype(np.int64)
+
+
+def _likely_boxes(abstract_state: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return where a box is likelier than not, [M, N * N]."""
+    return abstract_state[..., BOX].reshape(-1, _CELLS) > 0.5
 
 
 def count_visits(abstract_state: NDArray[np.float32], visits: VisitMemory) -> VisitCounts:
@@ -98,7 +102,7 @@ def count_visits(abstract_state: NDArray[np.float32], visits: VisitMemory) -> Vi
     recent = np.take_along_axis(here, back[:, :, None], axis=1)
     staying = np.cumprod(recent.any(2), axis=1).astype(np.bool_)
     since_arrival = (recent & staying[:, :, None]).sum(1)
-    is_box = abstract_state[..., BOX].reshape(len(cell), -1) > 0.5
+    is_box = _likely_boxes(abstract_state)
     boxes, known = key ^ _MIX[0][cell], visits.cells >= 0
     before = visits.keys ^ _MIX[0][visits.cells]
     tried = _tried_pushes(is_box, known & (before == boxes[:, None]), visits)
@@ -129,7 +133,7 @@ def _returning_pushes(
 
 def push_penalty(counts: VisitCounts) -> NDArray[np.float32]:
     """Return what is taken off the log-probability of each push that is wanted, [M, D, N, N]."""
-    return PUSH_WEIGHT * counts.pushes + RETURN_WEIGHT * counts.returns
+    return (PUSH_WEIGHT * counts.pushes + RETURN_WEIGHT * counts.returns).astype(np.float32)
 
 
 def visit_penalty(counts: VisitCounts) -> NDArray[np.float64]:

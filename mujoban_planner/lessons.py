@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mujoban_planner import load
 from mujoban_planner.boards import take_levels
@@ -151,18 +152,23 @@ def errs(planner: LearnedPlanner, samples: Samples) -> NDArray[np.bool_]:
     """
     n = len(samples.agent)
     found = np.zeros(n, np.bool_)
-    for rows in np.split(np.arange(n), range(_FORWARD, n, _FORWARD)) if n else ():
+    for start in range(0, n, _FORWARD):
+        rows = np.arange(start, min(start + _FORWARD, n))
         batch = make_batch(samples.take(rows), np.zeros(len(rows), np.int64))
         with torch.autocast("cpu", torch.bfloat16):
             output = planner(batch.state)
         wrong = batch.right.any(1) & ~batch.right.gather(1, output.policy.argmax(1, keepdim=True))[:, 0]
-        off = (torch.sigmoid(output.dead.float()) - batch.dead.float()).abs() > _TOLERANCE
-        wrong |= (off & batch.dead_known).any(1)
+        wrong |= _misjudged(output.dead, batch.dead, batch.dead_known)
         if output.push_dead is not None:
-            off = (torch.sigmoid(output.push_dead.float()) - batch.push_dead.float()).abs() > _TOLERANCE
-            wrong |= (off & batch.push_known).flatten(1).any(1)
+            wrong |= _misjudged(output.push_dead, batch.push_dead, batch.push_known)
         found[rows] = wrong.numpy()
     return found
+
+
+def _misjudged(logit: Tensor, dead: Tensor, known: Tensor) -> Tensor:
+    """Return in which states a known verdict is off by more than the tolerance, [B] from three of [B, ...]."""
+    off = (torch.sigmoid(logit.float()) - dead.float()).abs() > _TOLERANCE
+    return (off & known).flatten(1).any(1)
 
 
 def _states(levels: LevelBatch, game: Game, rows: NDArray[np.int64], times: NDArray[np.int64]) -> LevelBatch:

@@ -46,8 +46,8 @@ class LearnedPlanner(nn.Module, Planner):
     """A planner network with its decision rule.
 
     The decision is greedy over log pi(A | s) + caution * log(1 - p(dead | s, A)), one forward pass, less a penalty for
-    what was already tried (`decision.visit_penalty`), so that it neither repeats for ever a move that does nothing nor
-    runs in circles. The rule is deterministic; what it remembers is its explicit memory.
+    what was already tried (`decision.visit_penalty`, `decision.push_penalty`), so that it neither repeats for ever a
+    move that does nothing nor runs in circles. The rule is deterministic; what it remembers is its explicit memory.
     """
 
     def __init__(self, *, propagation: bool) -> None:

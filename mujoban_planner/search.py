@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from mujoban_planner.boards import BitBoards, state_tensor
+from mujoban_planner.heads import verdicts
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_sim.bitboard import NONE, ONE, SQUARE_STEP, SQUARES, Bits, bit, flood, lowest, shift
 from mujoban_sim.grid import Instruction
@@ -86,11 +87,9 @@ def search(planner: LearnedPlanner, starts: BitBoards, *, expansions: int, limit
 def _evaluate(planner: LearnedPlanner, boards: BitBoards) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how promising pushes are, as log-probabilities, [M, 4, I * I], and log p(alive), [M]."""
     device = next(planner.parameters()).device
-    output = planner(state_tensor(boards).to(device))
+    output, _ = planner.read(state_tensor(boards).to(device))
     alive = functional.logsigmoid(-output.dead[:, Instruction.STAY])
-    push = output.push
-    if output.push_dead is not None:
-        push = push + functional.logsigmoid(-output.push_dead)
+    push = output.push + verdicts(output)
     return push.flatten(2).double().cpu().numpy(), alive.double().cpu().numpy()
 
 

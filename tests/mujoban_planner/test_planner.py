@@ -170,7 +170,8 @@ def test_symmetric_views_bring_instructions_back():
             assert (turned - origin).tolist() == list(step)
     values, seen = torch.arange(5.0), torch.zeros(SYMMETRIES, 5)
     seen.scatter_(1, torch.tensor([instruction_map(s) for s in range(SYMMETRIES)]), values.expand(SYMMETRIES, -1))
-    assert torch.equal(average_instructions(seen, SYMMETRIES), values[None])
+    for views in range(1, SYMMETRIES + 1):  # each view alone shows in the difference to the mean before it
+        assert torch.equal(average_instructions(seen[:views], views), values[None])
 
 
 @pytest.mark.parametrize("planner", [ResidualPlanner(16, 2), RecurrentPlanner(8, 2), RecurrentPlanner(8, 1, 1, True)])
@@ -259,4 +260,4 @@ def test_soft_views_average_to_a_symmetric_policy():
     turned = view_states(torch.from_numpy(states), SYMMETRIES).unflatten(0, (SYMMETRIES, -1))[3].numpy()
     untried = count_visits(states, initial_visits(2))
     upright, seen = planner.scores(states, untried), planner.scores(turned, untried)
-    assert np.allclose(upright, seen[:, instruction_map(3)], atol=1e-3)
+    assert np.allclose(upright, seen[:, instruction_map(3)], atol=1e-4)
