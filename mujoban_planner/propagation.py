@@ -84,7 +84,8 @@ def walk_to_push(push: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
     free = torch.minimum(floor, 1.0 - box)
     wanted = push / push.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
     # A push in direction d starts in the cell whose neighbour in direction d holds the box.
-    start = torch.stack([shifted(wanted[:, d])[:, d] for d in range(4)], 1)  # Shape [B, D, I, I]
+    boxes = _neighbours(functional.pad(wanted, (1, 1, 1, 1)))
+    start = torch.stack([boxes[d][:, d] for d in range(4)], 1)  # Shape [B, D, I, I]
     mask = free[:, None, None].expand(-1, 1, 4, -1, -1)
     value = _spread(torch.minimum(start.amax(1), free)[:, None], mask, push.new_tensor(_WALK_DECAY))[:, 0]
     nearness = value.clamp(min=1e-6).log() / -math.log(_WALK_DECAY)
@@ -97,13 +98,18 @@ def walk_to_push(push: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
 def _spread(value: Tensor, mask: Tensor, decay: Tensor) -> Tensor:
     """Return values [B, P, I, I] after they spread against each direction where mask [B, P, D, I, I] lets them.
 
-    Works in place on a padded board, since the cost of one decision is that of its many small operations.
+    Works in place on a padded board, and on opposite directions at once, since the cost of one decision is that of its
+    many small operations.
     """
     board = functional.pad(value, (1, 1, 1, 1))
-    here, neighbours = board[..., 1:-1, 1:-1], _neighbours(board)
-    limits = [limit.contiguous() for limit in mask.unbind(2)]
+    here = board[..., 1:-1, 1:-1]
+    row, column = board.stride()[2:]
+    # What each cell's northern and southern, western and eastern neighbours hold, as views that follow the board.
+    vertical = board.as_strided((2, *here.shape), (2 * row, *board.stride()), column)
+    lateral = board.as_strided((2, *here.shape), (2 * column, *board.stride()), row)
+    north, east, south, west = mask.unbind(2)
+    upright, level = torch.stack([north, south]), torch.stack([west, east])
     for _ in range(ITERATIONS):
-        north, east, south, west = (torch.minimum(*pair) for pair in zip(limits, neighbours, strict=True))
-        best = torch.maximum(torch.maximum(north, east), torch.maximum(south, west))
-        torch.maximum(here, best.mul_(decay), out=here)
+        first, second = torch.maximum(torch.minimum(upright, vertical), torch.minimum(level, lateral))
+        torch.maximum(here, torch.maximum(first, second).mul_(decay), out=here)
     return here.clone()
