@@ -5,7 +5,8 @@ A push is therefore wanted less the more often it was tried with the boxes where
 back to where they were, so that the robot walks to another one; and each instruction is less attractive the more often
 it was tried in the same state. Estimates may flicker, so the robot's cell alone counts as well, more weakly.
 
-Shapes: M episodes, H = `HISTORY` decisions, A = 5 instructions, D = 4 directions, N = `grid.GRID_SIZE`.
+Shapes: M episodes, H = `HISTORY` decisions, A = 5 instructions, D = 4 directions, N = `grid.GRID_SIZE`,
+I = N - 2.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, Instruction
 
 HISTORY = 256
 """Decisions remembered; an episode has at most 240 s, some 120 moves."""
+THOUGHTS = 8
+"""Views of a board that what was thought of its pushes rests on: all symmetric ones, then the latest weigh more."""
 PUSH_WEIGHT = 3.0
 """Log-probability lost per earlier try of the push with the boxes where they are."""
 RETURN_WEIGHT = 6.0
@@ -78,11 +81,59 @@ def initial_visits(batch: int) -> VisitMemory:
     )
 
 
+class PushThoughts(NamedTuple):
+    """What was thought of the pushes since the boxes stand as they do: means over the views of the board so far.
+
+    Which push is best does not depend on where the robot is on its way to it, so that every decision of the walk can
+    look at the board from another side.
+    """
+
+    boxes: NDArray[np.int64]
+    """Hash of the boxes' arrangement, [M]."""
+    views: NDArray[np.int64]
+    """Number of views so far, [M]."""
+    push: NDArray[np.float32]
+    """Log-probability of each next push, [M, D, I, I]."""
+    push_alive: NDArray[np.float32]
+    """log(1 - p(dead)) of each push, [M, D, I, I]."""
+
+
+def initial_thoughts(batch: int) -> PushThoughts:
+    """Return the thoughts of `batch` episodes before the first."""
+    shape = (batch, len(_STEPS), GRID_SIZE - 2, GRID_SIZE - 2)
+    nothing = np.zeros(shape, np.float32)
+    return PushThoughts(np.zeros(batch, np.int64), np.zeros(batch, np.int64), nothing, nothing.copy())
+
+
+def recall(abstract_state: NDArray[np.float32], thoughts: PushThoughts) -> PushThoughts:
+    """Return what still holds of `thoughts` in these states, [M, N, N, 4]: nothing where the boxes have moved."""
+    boxes = _box_keys(abstract_state)
+    return thoughts._replace(boxes=boxes, views=np.where(boxes == thoughts.boxes, thoughts.views, 0))
+
+
+def ponder(
+    thoughts: PushThoughts, push: NDArray[np.float32], push_alive: NDArray[np.float32], views: int
+) -> PushThoughts:
+    """Return the thoughts after means over so many further views, [M, D, I, I] each."""
+    known = np.minimum(thoughts.views, THOUGHTS)
+    share = (views / (known + views)).astype(np.float32)[:, None, None, None]
+    return PushThoughts(
+        thoughts.boxes,
+        thoughts.views + views,
+        np.add(thoughts.push, share * (push - thoughts.push), dtype=np.float32),
+        np.add(thoughts.push_alive, share * (push_alive - thoughts.push_alive), dtype=np.float32),
+    )
+
+
 def state_keys(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return a hash of (agent's likeliest cell, boxes likelier than not), [M], and that cell, [M]."""
     cell = abstract_state[..., AGENT].reshape(-1, _CELLS).argmax(1)
-    boxes = np.bitwise_xor.reduce(np.where(_likely_boxes(abstract_state), _MIX[1], 0), axis=1)
-    return boxes ^ _MIX[0][cell], cell.astype(np.int64)
+    return _box_keys(abstract_state) ^ _MIX[0][cell], cell.astype(np.int64)
+
+
+def _box_keys(abstract_state: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return a hash of the cells in which a box is likelier than not, [M]."""
+    return np.bitwise_xor.reduce(np.where(_likely_boxes(abstract_state), _MIX[1], 0), axis=1)
 
 
 def _likely_boxes(abstract_state: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -236,7 +236,6 @@ def _make_lessons(
             if (found := weights.stat().st_mtime) != version:
                 try:
                     planner, version = load(weights), found
-                    planner.thinking = 1  # as in training: half the work
                 except WeightsError:  # caught between the two files of a newer version: try again
                     continue
             if planner is not None:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from mujoban_planner.abstract_env import MOVE_LIMIT, AbstractEnvironment
 from mujoban_planner.boards import likeliest_boards, state_tensor
-from mujoban_planner.decision import VisitCounts, VisitMemory, count_visits, initial_visits, remember, state_keys
-from mujoban_planner.planner import LearnedPlanner, check_abstract_state
+from mujoban_planner.decision import PushThoughts, VisitCounts, count_visits, recall, remember, state_keys
+from mujoban_planner.planner import LearnedPlanner, check_abstract_state, split_memory
 from mujoban_planner.search import search
-from mujoban_sim.interfaces import Memory, Planner
+from mujoban_sim.interfaces import Memory, Planner, put_rows
 
 _RETRY: Final = 6
 """Decisions by the policy alone after a search that found nothing."""
@@ -40,16 +40,16 @@ class LookAheadPlanner(Planner):
         """Network evaluations by searches so far."""
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return (plan, its cursor, the state that it continues from, decisions until a search, visits...)."""
+        """Return (plan, its cursor, the state that it continues from, decisions to wait, planner's memory...)."""
         plan = np.zeros((batch, MOVE_LIMIT + 1), np.int64)
         counters = np.zeros(batch, np.int64), np.full(batch, _NO_KEY, np.int64), np.zeros(batch, np.int64)
-        return (plan, *counters, *initial_visits(batch))
+        return (plan, *counters, *self.planner.initial_memory(batch))
 
     def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
         """Return an instruction for each state, [M] from [M, N, N, 4], and the next memory; errors as the planner's."""
         check_abstract_state(abstract_state)
         plan, cursor, expected, wait = (np.array(x) for x in memory[:4])
-        visits = VisitMemory(*memory[4:])
+        visits, thoughts = split_memory(memory[4:])
         key, _ = state_keys(abstract_state)
         lost = (key != expected) | (plan[np.arange(len(plan)), cursor] == 0)
         wait = np.maximum(wait - 1, 0)
@@ -63,13 +63,17 @@ class LookAheadPlanner(Planner):
         alone = (planned == 0) | stuck
         decision = planned.copy()
         if alone.any():
-            scores = self.planner.scores(abstract_state[alone], VisitCounts._make(x[alone] for x in counts))
+            before = recall(abstract_state[alone], PushThoughts._make(x[alone] for x in thoughts))
+            scores, after = self.planner.scores(
+                abstract_state[alone], VisitCounts._make(x[alone] for x in counts), before
+            )
+            thoughts = put_rows(thoughts, np.flatnonzero(alone), after)
             decision[alone] = np.argmax(scores, axis=1)
             plan[alone] = 0
         visits = remember(abstract_state, decision, visits)
         cursor = np.where(alone, 0, cursor + 1)
         expected = np.where(alone, _NO_KEY, _next_keys(abstract_state, decision))
-        return decision, (plan, cursor, expected, wait, *visits)
+        return decision, (plan, cursor, expected, wait, *visits, *thoughts)
 
     def _search(
         self, states: NDArray[np.float32], rows: NDArray[np.int64], plan: NDArray[np.int64], wait: NDArray[np.int64]

@@ -22,11 +22,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_planner.decision import (
+    PushThoughts,
     VisitCounts,
     VisitMemory,
     count_visits,
+    initial_thoughts,
     initial_visits,
+    ponder,
     push_penalty,
+    recall,
     remember,
     visit_penalty,
 )
@@ -38,8 +42,6 @@ from mujoban_sim.interfaces import Memory, Planner
 
 CAUTION = 4.0
 """Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/planner.md)."""
-VIEWS = 2
-"""Symmetric views of the board that a residual network averages over by default: what 5 ms on one core allow."""
 
 
 class LearnedPlanner(nn.Module, Planner):
@@ -47,7 +49,9 @@ class LearnedPlanner(nn.Module, Planner):
 
     The decision is greedy over log pi(A | s) + caution * log(1 - p(dead | s, A)), one forward pass, less a penalty for
     what was already tried (`decision.visit_penalty`, `decision.push_penalty`), so that it neither repeats for ever a
-    move that does nothing nor runs in circles. The rule is deterministic; what it remembers is its explicit memory.
+    move that does nothing nor runs in circles. What it thought of the pushes is averaged over the decisions in which
+    the boxes stand as they do (`decision.PushThoughts`). The rule is deterministic; what it remembers is its explicit
+    memory.
     """
 
     def __init__(self, *, propagation: bool) -> None:
@@ -100,8 +104,8 @@ class LearnedPlanner(nn.Module, Planner):
                 module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # not in the stubs
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return an empty record of visits for `batch` episodes."""
-        return initial_visits(batch)
+        """Return an empty record of visits and thoughts for `batch` episodes: `VisitMemory` and `PushThoughts`."""
+        return (*initial_visits(batch), *initial_thoughts(batch))
 
     def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
         """Return an instruction for each state, [M] from [M, N, N, 4], and the next memory.
@@ -110,27 +114,55 @@ class LearnedPlanner(nn.Module, Planner):
             ValueError: If the states have another shape or hold values that are not finite.
         """
         check_abstract_state(abstract_state)
-        visits = VisitMemory(*memory)
-        scores = self.scores(abstract_state, count_visits(abstract_state, visits))
+        visits, thoughts = split_memory(memory)
+        scores, thoughts = self.scores(
+            abstract_state, count_visits(abstract_state, visits), recall(abstract_state, thoughts)
+        )
         decision = np.argmax(scores, axis=1)
-        return decision, tuple(remember(abstract_state, decision, visits))
+        return decision, (*remember(abstract_state, decision, visits), *thoughts)
 
     @torch.inference_mode()
-    def scores(self, abstract_state: NDArray[np.float32], counts: VisitCounts) -> NDArray[np.float64]:
-        """Return log pi(A | s) + caution * log(1 - p(dead | s, A)), less what was tried before, [M, A]."""
+    def scores(
+        self, abstract_state: NDArray[np.float32], counts: VisitCounts, thoughts: PushThoughts
+    ) -> tuple[NDArray[np.float64], PushThoughts]:
+        """Return log pi(A | s) + caution * log(1 - p(dead | s, A)), less what was tried before, [M, A], and thoughts.
+
+        Args:
+            abstract_state: [M, N, N, 4].
+            counts: What was tried before.
+            thoughts: What was thought before with the boxes where they are.
+        """
         device = next(self.parameters()).device
         states = torch.from_numpy(np.ascontiguousarray(abstract_state, np.float32)).to(device)
-        reluctance = torch.from_numpy(push_penalty(counts)[..., 1:-1, 1:-1]).to(device)
-        advice = self.advise(states)
-        wanted = advice.push + self.caution * advice.push_alive - reluctance
-        policy = advice.policy + self.heads.guide(wanted, input_planes(states))
+        advice = self.advise(states, torch.from_numpy(thoughts.views).to(device))
+        thoughts = ponder(thoughts, advice.push.cpu().numpy(), advice.push_alive.cpu().numpy(), self.views)
+        wanted = thoughts.push + np.float32(self.caution) * thoughts.push_alive
+        wanted -= push_penalty(counts)[..., 1:-1, 1:-1]
+        policy = advice.policy + self.heads.guide(torch.from_numpy(wanted).to(device), input_planes(states))
         score = functional.log_softmax(policy, 1) + self.caution * advice.alive
-        return score.double().cpu().numpy() - visit_penalty(counts)
+        return score.double().cpu().numpy() - visit_penalty(counts), thoughts
 
-    def advise(self, states: Tensor) -> Advice:
-        """Return what a decision weighs in states [B, N, N, 4], with the thinking time that is set."""
+    @property
+    def views(self) -> int:
+        """Symmetric views of the board that go into one decision."""
+        return 1
+
+    def advise(self, states: Tensor, seen: Tensor) -> Advice:
+        """Return what a decision weighs, with the thinking time that is set.
+
+        Args:
+            states: [B, N, N, 4].
+            seen: Views of each state's boxes that were taken before, int64 [B].
+        """
+        del seen  # a network that takes the board as it is
         output, _ = self.read(states)
         return Advice(output.policy, functional.logsigmoid(-output.dead), output.push, verdicts(output))
+
+
+def split_memory(memory: Memory) -> tuple[VisitMemory, PushThoughts]:
+    """Return the two parts of a learned planner's memory."""
+    visits = len(VisitMemory._fields)
+    return VisitMemory(*memory[:visits]), PushThoughts(*memory[visits:])
 
 
 def check_abstract_state(abstract_state: NDArray[np.float32]) -> None:
@@ -172,6 +204,7 @@ class ResidualPlanner(LearnedPlanner):
     """Residual network over the board.
 
     Its thinking time is the number of symmetric views of the board whose outputs it averages, in one forward pass.
+    Each decision takes the next ones of the eight, until the boxes move.
     """
 
     def __init__(self, channels: int = 64, blocks: int = 8, propagation: bool = True, judge: bool = False) -> None:
@@ -181,7 +214,6 @@ class ResidualPlanner(LearnedPlanner):
         self.encoder = nn.Conv2d(self.inputs, channels, 3, padding=1)
         self.blocks = nn.Sequential(*(ResidualBlock(channels) for _ in range(blocks)))
         self.readout = PlannerHeads(channels, propagation=propagation, judge=judge)
-        self.thinking = VIEWS
 
     @property
     def config(self) -> dict[str, Any]:
@@ -197,17 +229,20 @@ class ResidualPlanner(LearnedPlanner):
         """Return features [B, C, I, I] of planes [B, `inputs`, I, I]."""
         return self.blocks(self.encoder(planes))
 
-    def advise(self, states: Tensor) -> Advice:
-        """Return the mean advice over `thinking` (at most 8) symmetric views."""
-        views = min(max(self.thinking, 1), SYMMETRIES)
-        if views == 1:
-            return super().advise(states)
-        policy, alive, push, push_alive = super().advise(view_states(states, views))
+    @property
+    def views(self) -> int:
+        """Symmetric views of the board that go into one decision, at most 8."""
+        return min(max(self.thinking, 1), SYMMETRIES)
+
+    def advise(self, states: Tensor, seen: Tensor) -> Advice:
+        """Return the mean advice over the next `views` symmetric views."""
+        symmetries = (seen[:, None] + torch.arange(self.views, device=seen.device)) % SYMMETRIES
+        policy, alive, push, push_alive = super().advise(view_states(states, symmetries), seen)
         return Advice(
-            average_instructions(policy, views),
-            average_instructions(alive, views),
-            average_pushes(push, views),
-            average_pushes(push_alive, views),
+            average_instructions(policy, symmetries),
+            average_instructions(alive, symmetries),
+            average_pushes(push, symmetries),
+            average_pushes(push_alive, symmetries),
         )
 
 

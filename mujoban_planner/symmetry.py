@@ -23,45 +23,46 @@ def transform_board(board: NDArray[np.generic], symmetry: int) -> NDArray[np.gen
     return turned[..., ::-1] if symmetry >= 4 else turned
 
 
-def view_states(states: Tensor, views: int) -> Tensor:
-    """Return abstract states [B, N, N, 4] under symmetries 0 to `views` - 1, [views * B, N, N, 4]."""
-    size = states.shape[1]
-    seen = states.flatten(1, 2)[:, _view_sources(size, views).to(states.device)]  # Shape [B, views, N * N, 4]
-    return seen.transpose(0, 1).reshape(-1, size, size, states.shape[3])
+def view_states(states: Tensor, symmetries: Tensor) -> Tensor:
+    """Return abstract states [B, N, N, 4] under `symmetries`, int64 [B, V]: [B * V, N, N, 4], state by state."""
+    size, channels = states.shape[2:]
+    sources = _view_sources(size).to(states.device)[symmetries].flatten(1)[:, :, None]  # Shape [B, V * N * N, 1]
+    return states.flatten(1, 2).take_along_dim(sources, 1).view(-1, size, size, channels)
 
 
-def average_instructions(values: Tensor, views: int) -> Tensor:
-    """Return the mean over views, [B, A], of values of instructions in `view_states`, [views * B, A]."""
-    values = values.unflatten(0, (views, -1))
-    return values.take_along_dim(_instruction_images(views).to(values.device), 2).mean(0)
+def average_instructions(values: Tensor, symmetries: Tensor) -> Tensor:
+    """Return the mean over views, [B, A], of values of instructions in `view_states`, [B * V, A]."""
+    images = _instruction_images().to(values.device)[symmetries]
+    return values.view(*symmetries.shape, -1).take_along_dim(images, 2).mean(1)
 
 
-def average_pushes(values: Tensor, views: int) -> Tensor:
+def average_pushes(values: Tensor, symmetries: Tensor) -> Tensor:
     """Return the mean over views, [B, D, I, I], of values of the push of each cell's box in each direction."""
     directions, size = values.shape[1:3]
-    flat = values.reshape(views, -1, directions * size * size)
-    return flat.take_along_dim(_push_images(size, views).to(values.device), 2).mean(0).view(-1, directions, size, size)
+    images = _push_images(size).to(values.device)[symmetries]
+    flat = values.reshape(*symmetries.shape, -1)
+    return flat.take_along_dim(images, 2).mean(1).view(-1, directions, size, size)
 
 
 @lru_cache
-def _view_sources(size: int, views: int) -> Tensor:
-    """Return the flat cell from which each cell of each view comes, int64 [views, size * size]."""
-    return torch.from_numpy(cell_sources(size)[:views])
+def _view_sources(size: int) -> Tensor:
+    """Return the flat cell from which each cell of each view comes, int64 [8, size * size]."""
+    return torch.from_numpy(cell_sources(size))
 
 
 @lru_cache
-def _instruction_images(views: int) -> Tensor:
-    """Return what each instruction is in each view, int64 [views, 1, A]."""
-    return torch.tensor([[instruction_map(s)] for s in range(views)])
+def _instruction_images() -> Tensor:
+    """Return what each instruction is in each view, int64 [8, A]."""
+    return torch.tensor([instruction_map(s) for s in range(SYMMETRIES)])
 
 
 @lru_cache
-def _push_images(size: int, views: int) -> Tensor:
-    """Return where the push of each cell's box in each direction stands in each view, int64 [views, 1, D * size**2]."""
-    images = np.argsort(cell_sources(size)[:views], axis=1)  # Shape [views, size * size]
-    directions = np.array([instruction_map(s)[1:] for s in range(views)]) - 1  # Shape [views, D]
+def _push_images(size: int) -> Tensor:
+    """Return where the push of each cell's box in each direction stands in each view, int64 [8, D * size**2]."""
+    images = np.argsort(cell_sources(size), axis=1)  # Shape [8, size * size]
+    directions = np.array([instruction_map(s)[1:] for s in range(SYMMETRIES)]) - 1  # Shape [8, D]
     flat = directions[:, :, None] * size * size + images[:, None]
-    return torch.from_numpy(flat.reshape(views, 1, -1))
+    return torch.from_numpy(flat.reshape(SYMMETRIES, -1))
 
 
 @lru_cache

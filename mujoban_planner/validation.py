@@ -45,12 +45,10 @@ class NetworkConfig:
     """Judge each push where the box is (with propagation)."""
 
     def build(self) -> LearnedPlanner:
-        """Return a new network, with the thinking time of training."""
+        """Return a new network."""
         if self.architecture == "recurrent":
             return RecurrentPlanner(self.channels, self.depth, self.repeats, self.propagation, self.judge)
-        network = ResidualPlanner(self.channels, self.blocks, self.propagation, self.judge)
-        network.thinking = 1
-        return network
+        return ResidualPlanner(self.channels, self.blocks, self.propagation, self.judge)
 
 
 def validation_levels(difficulty: int, n: int) -> LevelBatch:

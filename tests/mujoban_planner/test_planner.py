@@ -4,7 +4,7 @@ import torch
 
 import mujoban_planner
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.decision import HISTORY, count_visits, initial_visits, remember
+from mujoban_planner.decision import HISTORY, count_visits, initial_thoughts, initial_visits, recall, remember
 from mujoban_planner.heads import Advice, PlannerHeads
 from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner, ResidualPlanner, input_planes
 from mujoban_planner.play import play
@@ -16,12 +16,13 @@ from mujoban_planner.symmetry import (
     instruction_map,
     view_states,
 )
-from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.weights import save_weights
 from mujoban_sim.generator import generate_batch
 from mujoban_sim.grid import GRID_SIZE, Instruction
 from mujoban_sim.interfaces import take_rows
 from mujoban_sim.levels import Level, stack_levels
+
+ALL = torch.arange(SYMMETRIES)[None]
 
 
 class Stubborn(LearnedPlanner):
@@ -38,7 +39,7 @@ class Stubborn(LearnedPlanner):
 
     heads = PlannerHeads(1, propagation=False, judge=False)
 
-    def advise(self, states):
+    def advise(self, states, seen):
         pushes = torch.zeros(len(states), 4, 8, 8)
         return Advice(self.preference.expand(len(states), -1), torch.zeros(len(states), 5), pushes, pushes)
 
@@ -164,14 +165,14 @@ def test_symmetric_views_bring_instructions_back():
             moved = states.clone()
             moved[..., 2] = 0
             moved[0, where[0] + offset[0], where[1] + offset[1], 2] = 1
-            turned = torch.argwhere(view_states(moved, SYMMETRIES)[symmetry, ..., 2])[0]
-            origin = torch.argwhere(view_states(states, SYMMETRIES)[symmetry, ..., 2])[0]
+            turned = torch.argwhere(view_states(moved, ALL)[symmetry, ..., 2])[0]
+            origin = torch.argwhere(view_states(states, ALL)[symmetry, ..., 2])[0]
             step = [(0, 0), (-1, 0), (0, 1), (1, 0), (0, -1)][names[a]]
             assert (turned - origin).tolist() == list(step)
     values, seen = torch.arange(5.0), torch.zeros(SYMMETRIES, 5)
     seen.scatter_(1, torch.tensor([instruction_map(s) for s in range(SYMMETRIES)]), values.expand(SYMMETRIES, -1))
     for views in range(1, SYMMETRIES + 1):  # each view alone shows in the difference to the mean before it
-        assert torch.equal(average_instructions(seen[:views], views), values[None])
+        assert torch.equal(average_instructions(seen[:views], ALL[:, :views]), values[None])
 
 
 @pytest.mark.parametrize("planner", [ResidualPlanner(16, 2), RecurrentPlanner(8, 2), RecurrentPlanner(8, 1, 1, True)])
@@ -226,8 +227,8 @@ def test_robot_walks_to_another_push_when_one_was_tried():
     def eagerness(tried: Instruction) -> float:
         pushes = np.zeros((1, 4, GRID_SIZE, GRID_SIZE), np.float32)
         pushes[:, tried - 1] = 5
-        scores = planner.scores(states, untried._replace(pushes=pushes))[0]
-        return scores[Instruction.EAST] - scores[Instruction.WEST]
+        scores, _ = planner.scores(states, untried._replace(pushes=pushes), initial_thoughts(1))
+        return scores[0, Instruction.EAST] - scores[0, Instruction.WEST]
 
     assert eagerness(Instruction.WEST) > eagerness(Instruction.EAST) + 2.0
 
@@ -239,25 +240,37 @@ def test_symmetric_views_bring_pushes_back():
         return legal_pushes(input_planes(boards), torch.ones(len(boards), 8, 8))
 
     for views in range(1, SYMMETRIES + 1):
-        assert torch.equal(average_pushes(pushes(view_states(states, views)), views), pushes(states))
+        symmetries = (torch.tensor([[0], [3], [6]]) + torch.arange(views)) % SYMMETRIES  # other views of each state
+        assert torch.equal(average_pushes(pushes(view_states(states, symmetries)), symmetries), pushes(states))
 
 
-def test_decisions_average_two_views_by_default_and_training_takes_one():
-    planner, states = ResidualPlanner(16, 2).eval(), _states(4)
-    untried = count_visits(states, initial_visits(4))
-    averaged = planner.scores(states, untried)
-    planner.thinking = 2
-    assert np.array_equal(averaged, planner.scores(states, untried))
-    planner.thinking = 1
-    assert not np.allclose(averaged, planner.scores(states, untried))
-    assert NetworkConfig().build().thinking == 1
-
-
-def test_soft_views_average_to_a_symmetric_policy():
-    planner = ResidualPlanner(16, 2).eval()
+def test_thinking_time_averages_symmetric_views():
+    planner, states = ResidualPlanner(16, 2).eval(), _states(2)
     planner.thinking = 8
-    states = _states(2)
-    turned = view_states(torch.from_numpy(states), SYMMETRIES).unflatten(0, (SYMMETRIES, -1))[3].numpy()
+    turned = view_states(torch.from_numpy(states), torch.full((2, 1), 3)).numpy()
     untried = count_visits(states, initial_visits(2))
-    upright, seen = planner.scores(states, untried), planner.scores(turned, untried)
+    upright, seen = (planner.scores(s, untried, initial_thoughts(2))[0] for s in (states, turned))
     assert np.allclose(upright, seen[:, instruction_map(3)], atol=1e-4)
+    planner.thinking = 1
+    assert not np.allclose(upright, planner.scores(states, untried, initial_thoughts(2))[0], atol=1e-4)
+
+
+def test_decisions_look_at_the_boxes_from_another_side_each_time():
+    planner, states = ResidualPlanner(16, 2).eval(), _states(2)
+    untried = count_visits(states, initial_visits(2))
+    thoughts = initial_thoughts(2)
+    for _ in range(SYMMETRIES):
+        thoughts = recall(states, thoughts)
+        _, thoughts = planner.scores(states, untried, thoughts)
+    planner.thinking = SYMMETRIES
+    _, at_once = planner.scores(states, untried, recall(states, initial_thoughts(2)))
+    assert all(np.allclose(a, b, atol=1e-5) for a, b in zip(thoughts, at_once, strict=True))
+
+
+def test_thoughts_end_where_the_boxes_move():
+    states = _states(2)
+    thoughts = recall(states, initial_thoughts(2))._replace(views=np.array([5, 5]))
+    assert recall(states, thoughts).views.tolist() == [5, 5]
+    moved = states.copy()
+    moved[1, ..., 3] = np.roll(states[1, ..., 3], 1, axis=0)
+    assert recall(moved, thoughts).views.tolist() == [5, 0]
