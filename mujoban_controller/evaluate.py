@@ -1,6 +1,7 @@
 """Judge the controller: `python -m mujoban_controller.evaluate --episodes 512 --seed 1000`.
 
-Whole episodes of a solver's plans with exact termination signals; prints JSON. `--driver` compares the camera policy
+Whole episodes of a solver's plans with exact termination signals, or random instructions of every kind with
+`--instructions random`; prints JSON. `--driver` compares the camera policy
 with the scripted driver or a privileged teacher under the same judgement, which shows the loss from distillation.
 """
 
@@ -28,10 +29,12 @@ from mujoban_sim.oracles import OraclePlanner
 
 @dataclass(frozen=True)
 class Options:
-    """Judge the controller on solver plans."""
+    """Judge the controller on instructions."""
 
     driver: Literal["camera", "teacher", "scripted"] = "camera"
     """Camera policy, privileged policy or scripted driver."""
+    instructions: Literal["plans", "random"] = "plans"
+    """A solver's plans, or random moves, pushes, stays, and instructions towards walls and blocked boxes."""
     weights: Path | None = None
     """Weights of camera policy or teacher; those that ship by default."""
     episodes: int = 128
@@ -75,6 +78,7 @@ def main() -> int:
         report = judge(
             driver, OraclePlanner(), episodes=options.episodes, first_seed=options.seed,
             difficulty=options.difficulty, body=options.body, batch=options.batch, threads=options.threads,
+            plans=options.instructions == "plans",
         )  # fmt: skip
     except (ValueError, OSError) as error:
         print(f"mujoban_controller.evaluate: error: {error}", file=sys.stderr)

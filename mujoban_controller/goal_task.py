@@ -89,18 +89,22 @@ class GoalTaskConfig:
             raise ValueError(f"tolerance {self.tolerance}: expected at most the evaluation's {COMPLETION_TOLERANCE}")
 
 
-def judging_config(batch: int, body: str = "ball", difficulty: int = 5) -> GoalTaskConfig:
-    """Return the settings under which controllers are judged: the planner's instructions, exact signals."""
+def judging_config(batch: int, body: str = "ball", difficulty: int = 5, *, plans: bool = True) -> GoalTaskConfig:
+    """Return the settings under which controllers are judged: exact signals and the planner's instructions.
+
+    Without `plans` they are random ones of every kind, and an episode ends after 1,000 steps on average.
+    """
     return GoalTaskConfig(
         batch=batch,
         body=body,
         difficulty=difficulty,
         tolerance=COMPLETION_TOLERANCE,
-        planned=1.0,
+        planned=float(plans),
         astray=0.0,
-        horizon=math.inf,
+        horizon=math.inf if plans else 1000.0,
         misaligned=0.0,
         patience=12,
+        instructions=InstructionConfig(stay=0.1, infeasible=0.2),
         terminations=EXACT,
     )
 

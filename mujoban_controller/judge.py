@@ -105,8 +105,9 @@ def judge(
     body: str = "ball",
     batch: int = 64,
     threads: int = 1,
+    plans: bool = True,
 ) -> dict[str, Any]:
-    """Play whole episodes with a planner's instructions and exact termination signals.
+    """Play episodes with a planner's instructions, or random ones, and exact termination signals.
 
     Args:
         driver: A controller, learned or privileged, or anything else that drives.
@@ -117,6 +118,8 @@ def judge(
         body: Robot's body.
         batch: Levels played at once.
         threads: Threads for physics.
+        plans: Follow the planner; else instructions are random, towards walls and blocked boxes too, and only
+            `instructions` is returned.
 
     Returns:
         `success_rate`, `success_interval`, `mean_return`, `median_steps`, `lost` (seeds with the last failure of
@@ -124,7 +127,7 @@ def judge(
     """
     batch = min(batch, episodes)
     task = GoalTask(
-        judging_config(batch, body, difficulty), planner, SeededEpisodes(difficulty, first_seed),
+        judging_config(batch, body, difficulty, plans=plans), planner, SeededEpisodes(difficulty, first_seed),
         np.random.default_rng(first_seed), threads=threads,
     )  # fmt: skip
     last_seed = first_seed + episodes
@@ -144,6 +147,8 @@ def judge(
                     lost[str(end.seed)] = failure
             spec = task.world.episodes[end.row]
             seeds[end.row] = last_seed if spec is None else spec.seed
+    if not plans:
+        return {"instructions": summary.report()}
     solved = sum(e.solved for e in ended)
     return {
         "success_rate": solved / episodes,

@@ -133,6 +133,14 @@ def test_the_scripted_driver_pushes_fast_and_keeps_boxes_on_their_lanes():
     assert instructions["kinds"]["push"]["median_steps"] <= 36
 
 
+def test_random_instructions_judge_every_kind():
+    report = judge(scripted_driver, OraclePlanner(), episodes=8, first_seed=7, difficulty=5, plans=False)
+    kinds = report["instructions"]["kinds"]
+    assert set(kinds) == {"move", "push", "stay", "blocked"}
+    assert all(kind["success_rate"] > 0.9 for kind in kinds.values())
+    assert report["instructions"]["feasible"]["n"] == sum(k["n"] for name, k in kinds.items() if name != "blocked")
+
+
 def test_controllers_and_drivers_are_judged_alike():
     report = judge(OracleController(), OraclePlanner(), episodes=2, first_seed=7, difficulty=1)
     assert report["success_rate"] == 1.0
