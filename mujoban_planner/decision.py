@@ -6,7 +6,7 @@ back to where they were, so that the robot walks to another one; and each instru
 it was tried in the same state. Estimates may flicker, so the robot's cell alone counts as well, more weakly.
 
 Shapes: M episodes, H = `HISTORY` decisions, A = 5 instructions, D = 4 directions, N = `grid.GRID_SIZE`,
-I = N - 2.
+I = N - 2 = `heads.INTERIOR`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_planner.heads import INTERIOR
+from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, Instruction
 
 HISTORY = 256
 """Decisions remembered; an episode has at most 240 s, some 120 moves."""
-THOUGHTS = 8
-"""Views of a board that what was thought of its pushes rests on: all symmetric ones, then the latest weigh more."""
 PUSH_WEIGHT = 3.0
 """Log-probability lost per earlier try of the push with the boxes where they are."""
 RETURN_WEIGHT = 6.0
@@ -100,7 +100,7 @@ class PushThoughts(NamedTuple):
 
 def initial_thoughts(batch: int) -> PushThoughts:
     """Return the thoughts of `batch` episodes before the first."""
-    shape = (batch, len(_STEPS), GRID_SIZE - 2, GRID_SIZE - 2)
+    shape = (batch, len(_STEPS), INTERIOR, INTERIOR)
     nothing = np.zeros(shape, np.float32)
     return PushThoughts(np.zeros(batch, np.int64), np.zeros(batch, np.int64), nothing, nothing.copy())
 
@@ -114,8 +114,11 @@ def recall(abstract_state: NDArray[np.float32], thoughts: PushThoughts) -> PushT
 def ponder(
     thoughts: PushThoughts, push: NDArray[np.float32], push_alive: NDArray[np.float32], views: int
 ) -> PushThoughts:
-    """Return the thoughts after means over so many further views, [M, D, I, I] each."""
-    known = np.minimum(thoughts.views, THOUGHTS)
+    """Return the thoughts after means over so many further views, [M, D, I, I] each.
+
+    Once every symmetric view was taken, the latest weigh more.
+    """
+    known = np.minimum(thoughts.views, SYMMETRIES)
     share = (views / (known + views)).astype(np.float32)[:, None, None, None]
     return PushThoughts(
         thoughts.boxes,

@@ -18,7 +18,7 @@ from mujoban_planner.boards import likeliest_boards, state_tensor
 from mujoban_planner.decision import PushThoughts, VisitCounts, count_visits, recall, remember, state_keys
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state, split_memory
 from mujoban_planner.search import search
-from mujoban_sim.interfaces import Memory, Planner, put_rows
+from mujoban_sim.interfaces import Memory, Planner, put_rows, take_rows
 
 _RETRY: Final = 6
 """Decisions by the policy alone after a search that found nothing."""
@@ -63,11 +63,10 @@ class LookAheadPlanner(Planner):
         alone = (planned == 0) | stuck
         decision = planned.copy()
         if alone.any():
-            before = recall(abstract_state[alone], PushThoughts._make(x[alone] for x in thoughts))
-            scores, after = self.planner.scores(
-                abstract_state[alone], VisitCounts._make(x[alone] for x in counts), before
-            )
-            thoughts = put_rows(thoughts, np.flatnonzero(alone), after)
+            rows = np.flatnonzero(alone)
+            before = recall(abstract_state[rows], PushThoughts(*take_rows(thoughts, rows)))
+            scores, after = self.planner.scores(abstract_state[rows], VisitCounts(*take_rows(counts, rows)), before)
+            thoughts = put_rows(thoughts, rows, after)
             decision[alone] = np.argmax(scores, axis=1)
             plan[alone] = 0
         visits = remember(abstract_state, decision, visits)

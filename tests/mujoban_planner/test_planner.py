@@ -16,6 +16,7 @@ from mujoban_planner.symmetry import (
     instruction_map,
     view_states,
 )
+from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.weights import save_weights
 from mujoban_sim.generator import generate_batch
 from mujoban_sim.grid import GRID_SIZE, Instruction
@@ -265,6 +266,7 @@ def test_decisions_look_at_the_boxes_from_another_side_each_time():
     planner.thinking = SYMMETRIES
     _, at_once = planner.scores(states, untried, recall(states, initial_thoughts(2)))
     assert all(np.allclose(a, b, atol=1e-5) for a, b in zip(thoughts, at_once, strict=True))
+    assert NetworkConfig().build().thinking == 1
 
 
 def test_thoughts_end_where_the_boxes_move():
