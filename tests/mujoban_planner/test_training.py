@@ -55,18 +55,18 @@ def test_the_same_run_gives_the_same_weights(tmp_path):
 
 def test_a_small_batch_can_be_learned_by_heart():
     torch.manual_seed(0)
-    config = ImitationConfig(**SMALL)
+    config = ImitationConfig(**{**SMALL, "channels": 16})  # with 8, every eighth draw of the weights gets stuck
     network = config.build()
     samples = LessonMaker(0, {3: 1.0}).demonstrations(2)
     samples = samples.take(samples.right != 0)
     batch = make_batch(samples, np.zeros(len(samples.agent), np.int64))
-    adam = torch.optim.Adam(network.parameters(), 1e-2)
+    adam = torch.optim.Adam(network.parameters(), 3e-3)
     for _ in range(150):
         loss, stats = imitation_loss(network, batch, config)
         adam.zero_grad()
         loss.backward()
         adam.step()
-    assert stats["accuracy"] > 0.95 and stats["push_accuracy"] > 0.8
+    assert stats["accuracy"] > 0.95 and stats["push_accuracy"] > 0.95
 
 
 def test_uncertain_states_keep_boxes_targets_and_robot_recognisable():
