@@ -39,6 +39,11 @@ def take_levels(levels: LevelBatch, rows: NDArray[Any]) -> LevelBatch:
     return LevelBatch(levels.wall[rows], levels.target[rows], levels.boxes[rows], levels.player[rows])
 
 
+def join_levels(parts: list[LevelBatch]) -> LevelBatch:
+    """Return the levels of all parts, which have as many boxes each."""
+    return LevelBatch._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
+
+
 def abstract_states(levels: LevelBatch) -> NDArray[np.float32]:
     """Return s_abst of every level, [B, N, N, 4]."""
     state = np.zeros((*levels.wall.shape, len(CHANNELS)), np.float32)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_planner import load
-from mujoban_planner.boards import take_levels
+from mujoban_planner.boards import join_levels, take_levels
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import Game, play
 from mujoban_planner.samples import Samples, concatenate, make_batch
@@ -41,6 +41,10 @@ _EASY_SHARE: Final = 0.25
 """Share that is kept of the states of such ways in which the planner has nothing to learn; most are."""
 _TOLERANCE: Final = 0.1
 """Distance of a verdict, a probability, from the truth from which on there is something to learn."""
+_REPLAYED: Final = 0.5
+"""Levels lost before that are played once more, per fresh level, while there are some."""
+_LOST_LEVELS: Final = 4096
+"""Lost levels kept of each difficulty."""
 _FORWARD: Final = 1024
 """States in one forward pass."""
 _SEEDS_PER_STREAM: Final = 10**12
@@ -67,21 +71,23 @@ class LessonMaker:
         self._mix = {d: share / sum(mix.values()) for d, share in mix.items() if share > 0}
         self._teacher = Teacher()
         self._judged = judged
+        self._lost: dict[int, LevelBatch] = {}
 
-    def levels(self, n: int) -> list[LevelBatch]:
-        """Return about `n` fresh levels, one part per difficulty."""
+    def levels(self, n: int) -> dict[int, LevelBatch]:
+        """Return `n` fresh levels by difficulty."""
         counts = self._rng.multinomial(n, list(self._mix.values()))
-        parts = []
+        parts = {}
         for difficulty, count in zip(self._mix, counts.tolist(), strict=True):
             if count:
                 seeds = range(self._next, self._next + count)
                 self._next += count
-                parts.append(generate_batch(difficulty, seeds))
+                parts[difficulty] = generate_batch(difficulty, seeds)
         return parts
 
     def demonstrations(self, n: int = 256) -> Samples:
         """Return samples of the solutions of `n` fresh levels, thinned on walks."""
-        parts = [self._teacher.demonstrate(levels, self._rng, judged=self._judged) for levels in self.levels(n)]
+        fresh = self.levels(n).values()
+        parts = [self._teacher.demonstrate(levels, self._rng, judged=self._judged) for levels in fresh]
         samples = concatenate(parts)
         walking = (samples.right != 0) & (samples.right & possible_pushes(samples.boards) == 0)
         return samples.take(~walking | (self._rng.random(len(walking)) < _WALK_SHARE))
@@ -89,23 +95,42 @@ class LessonMaker:
     def corrections(self, planner: LearnedPlanner, n: int = 128) -> Samples:
         """Let the planner play `n` fresh levels and return what it should have done where it went wrong.
 
-        A lost level is searched for the instruction that lost it; the demonstration starts from the state before.
+        A lost level is searched for the instruction that lost it; the demonstration starts from the state before. It
+        is played again later, until it is solved (prioritized level replay, Jiang et al. 2021).
         """
         parts = []
-        for levels in self.levels(n):
+        for difficulty, fresh in self.levels(n).items():
+            levels = join_levels([fresh, self._take_lost(difficulty, int(_REPLAYED * len(fresh.player)))])
             exploration = 0.05 if self._rng.random() < 0.5 else 0.0
             game = play(
                 planner, levels, limit=_PLAY_LIMIT, exploration=exploration, rng=self._rng, reduced_precision=True
             )
-            lost, on_its_way = self._correct(levels, game)
+            first_dead = self._first_dead(levels, game)
+            self._keep_lost(difficulty, take_levels(levels, first_dead > 0))
+            lost, on_its_way = self._correct(levels, game, first_dead)
             parts += [*lost, self._prioritise(planner, concatenate(on_its_way))]
         return concatenate(parts)
 
-    def _correct(self, levels: LevelBatch, game: Game) -> tuple[list[Samples], list[Samples]]:
-        """Return samples of where levels were lost, and of states anywhere on the way of all."""
+    def _take_lost(self, difficulty: int, n: int) -> LevelBatch:
+        """Return up to `n` random levels that were lost, and forget them: they come back if they are lost again."""
+        lost = self._lost.get(difficulty)
+        if lost is None:
+            return generate_batch(difficulty, [])
+        order = self._rng.permutation(len(lost.player))
+        self._lost[difficulty] = take_levels(lost, order[n:])
+        return take_levels(lost, order[:n])
+
+    def _keep_lost(self, difficulty: int, lost: LevelBatch) -> None:
+        known = self._lost.get(difficulty)
+        pool = lost if known is None else join_levels([lost, known])
+        self._lost[difficulty] = take_levels(pool, np.arange(len(pool.player)) < _LOST_LEVELS)
+
+    def _correct(
+        self, levels: LevelBatch, game: Game, first_dead: NDArray[np.int64]
+    ) -> tuple[list[Samples], list[Samples]]:
+        """Return samples of where levels were lost, first dead at [B], and of states anywhere on the way of all."""
         batch = np.arange(len(game.moves))
         length = np.where(game.solved, game.moves, _PLAY_LIMIT)
-        first_dead = self._first_dead(levels, game)
         lost = first_dead > 0
         parts, on_its_way = [], []
         # Where it went wrong: the state before, what killed it, and a dead state.

@@ -6,6 +6,7 @@ from mujoban_planner import load
 from mujoban_planner.boards import abstract_states, bit_boards, likeliest_boards, state_tensor, take_levels
 from mujoban_planner.lessons import LessonMaker, errs
 from mujoban_planner.planner import ResidualPlanner, input_planes
+from mujoban_planner.play import play
 from mujoban_planner.propagation import legal_pushes, propagate, walk_to_push
 from mujoban_planner.samples import SampleBuffer, make_batch, unlabelled
 from mujoban_planner.symmetry import SYMMETRIES, view_states
@@ -145,6 +146,23 @@ def test_corrections_show_the_way_from_where_an_untrained_planner_went_wrong():
     samples = LessonMaker(3, {5: 1.0}).corrections(ResidualPlanner(8, 1).eval(), n=6)
     deadly = (samples.dead != 0) & (samples.dead != 31)
     assert (samples.right != 0).any() and deadly.any()
+
+
+def test_lost_levels_are_played_again(monkeypatch):
+    played = []
+
+    def record(planner, levels, **options):
+        played.append({wall.tobytes() for wall in levels.wall})
+        return play(planner, levels, **options)
+
+    monkeypatch.setattr("mujoban_planner.lessons.play", record)
+    maker, beginner = LessonMaker(5, {5: 1.0}), ResidualPlanner(8, 1).eval()
+    for _ in range(2):
+        maker.corrections(beginner, n=6)
+    first, second = played
+    assert len(first) == 6
+    again = second & first
+    assert 1 <= len(again) <= 3 and len(second) == 6 + len(again)
 
 
 def test_planner_errs_where_the_truth_is_another_than_it_says():
