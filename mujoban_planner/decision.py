@@ -128,6 +128,38 @@ def ponder(
     )
 
 
+def hesitate(
+    abstract_state: NDArray[np.float32],
+    decision: NDArray[np.int64],
+    thoughts: PushThoughts,
+    *,
+    doubt: float,
+    perspectives: int,
+) -> NDArray[np.int64]:
+    """Return the decisions, [M], with STAY in place of pushes that may be deadly and deserve another look.
+
+    A push cannot be taken back, and standing still costs little. Recurrent planners learn to pace before hard pushes
+    for the same reason: it gives them time to think (Taufeeque et al. 2024).
+
+    Args:
+        abstract_state: [M, N, N, 4].
+        decision: The decisions so far, [M].
+        thoughts: What was thought of the pushes, these decisions included.
+        doubt: Probability that a push is deadly from which on another look is worth its time.
+        perspectives: Views after which there is nothing new to see.
+    """
+    rows = np.arange(len(decision))
+    _, cell = state_keys(abstract_state)
+    direction = decision - 1  # -1 is STAY, which pushes nothing
+    ahead = (cell + _STEPS[direction]) % _CELLS
+    pushing = _likely_boxes(abstract_state)[rows, ahead] & (decision != Instruction.STAY)
+    # A box stands in the interior, where `ahead` has its verdict.
+    row, column = np.clip(np.array(divmod(ahead, GRID_SIZE)) - 1, 0, INTERIOR - 1)
+    alive = np.exp(thoughts.push_alive[rows, direction, row, column])
+    again = pushing & (alive < 1.0 - doubt) & (thoughts.views < perspectives)
+    return np.where(again, Instruction.STAY, decision)
+
+
 def state_keys(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return a hash of (agent's likeliest cell, boxes likelier than not), [M], and that cell, [M]."""
     cell = abstract_state[..., AGENT].reshape(-1, _CELLS).argmax(1)

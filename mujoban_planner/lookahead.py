@@ -65,9 +65,9 @@ class LookAheadPlanner(Planner):
         if alone.any():
             rows = np.flatnonzero(alone)
             before = recall(abstract_state[rows], PushThoughts(*take_rows(thoughts, rows)))
-            scores, after = self.planner.scores(abstract_state[rows], VisitCounts(*take_rows(counts, rows)), before)
+            chosen, after = self.planner.choose(abstract_state[rows], VisitCounts(*take_rows(counts, rows)), before)
             thoughts = put_rows(thoughts, rows, after)
-            decision[alone] = np.argmax(scores, axis=1)
+            decision[alone] = chosen
             plan[alone] = 0
         visits = remember(abstract_state, decision, visits)
         cursor = np.where(alone, 0, cursor + 1)

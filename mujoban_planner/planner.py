@@ -26,6 +26,7 @@ from mujoban_planner.decision import (
     VisitCounts,
     VisitMemory,
     count_visits,
+    hesitate,
     initial_thoughts,
     initial_visits,
     ponder,
@@ -44,13 +45,18 @@ CAUTION = 4.0
 """Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/planner.md)."""
 
 
+DOUBT = 0.02
+"""Probability that a push is deadly from which on the planner looks again before it, by default (docs/planner.md)."""
+
+
 class LearnedPlanner(nn.Module, Planner):
     """A planner network with its decision rule.
 
     The decision is greedy over log pi(A | s) + caution * log(1 - p(dead | s, A)), one forward pass, less a penalty for
     what was already tried (`decision.visit_penalty`, `decision.push_penalty`), so that it neither repeats for ever a
     move that does nothing nor runs in circles. What it thought of the pushes is averaged over the decisions in which
-    the boxes stand as they do (`decision.PushThoughts`). The rule is deterministic; what it remembers is its explicit
+    the boxes stand as they do (`decision.PushThoughts`), and before a push that may be deadly it stands still until it
+    has looked from every side (`decision.hesitate`). The rule is deterministic; what it remembers is its explicit
     memory.
     """
 
@@ -62,6 +68,8 @@ class LearnedPlanner(nn.Module, Planner):
         """Thinking time: repeats of the recurrent core, or symmetric views, per decision; 1 is as trained."""
         self.caution = CAUTION
         """Weight of the verdicts on pushes and instructions in a decision; 1 is as trained."""
+        self.doubt = DOUBT
+        """Probability that a push is deadly from which on the planner looks again before it; 1 is never."""
 
     @property
     @abstractmethod
@@ -115,11 +123,18 @@ class LearnedPlanner(nn.Module, Planner):
         """
         check_abstract_state(abstract_state)
         visits, thoughts = split_memory(memory)
-        scores, thoughts = self.scores(
+        decision, thoughts = self.choose(
             abstract_state, count_visits(abstract_state, visits), recall(abstract_state, thoughts)
         )
-        decision = np.argmax(scores, axis=1)
         return decision, (*remember(abstract_state, decision, visits), *thoughts)
+
+    def choose(
+        self, abstract_state: NDArray[np.float32], counts: VisitCounts, thoughts: PushThoughts
+    ) -> tuple[NDArray[np.int64], PushThoughts]:
+        """Return the instruction of the highest score, or STAY to look again first, [M], and thoughts; see `scores`."""
+        scores, thoughts = self.scores(abstract_state, counts, thoughts)
+        best = np.argmax(scores, axis=1)
+        return hesitate(abstract_state, best, thoughts, doubt=self.doubt, perspectives=self.perspectives), thoughts
 
     @torch.inference_mode()
     def scores(
@@ -145,6 +160,11 @@ class LearnedPlanner(nn.Module, Planner):
     @property
     def views(self) -> int:
         """Symmetric views of the board that go into one decision."""
+        return 1
+
+    @property
+    def perspectives(self) -> int:
+        """Different views of the board that successive decisions take; one more tells nothing new."""
         return 1
 
     def advise(self, states: Tensor, seen: Tensor) -> Advice:
@@ -233,6 +253,11 @@ class ResidualPlanner(LearnedPlanner):
     def views(self) -> int:
         """Symmetric views of the board that go into one decision, at most 8."""
         return min(max(self.thinking, 1), SYMMETRIES)
+
+    @property
+    def perspectives(self) -> int:
+        """The eight symmetric views of the board."""
+        return SYMMETRIES
 
     def advise(self, states: Tensor, seen: Tensor) -> Advice:
         """Return the mean advice over the next `views` symmetric views."""

@@ -269,6 +269,40 @@ def test_decisions_look_at_the_boxes_from_another_side_each_time():
     assert NetworkConfig().build().thinking == 1
 
 
+class Doubtful(Stubborn):
+    """Wants to go north and takes every push for deadly with some probability."""
+
+    perspectives = SYMMETRIES
+
+    def __init__(self, p_dead):
+        super().__init__()
+        self.p_dead = p_dead
+
+    def advise(self, states, seen):
+        advice = super().advise(states, seen)
+        return advice._replace(push_alive=torch.full((len(states), 4, 8, 8), 1.0 - self.p_dead).log())
+
+
+@pytest.mark.parametrize(
+    ("p_dead", "ahead", "looks"),
+    [(0.1, "#  $     #", SYMMETRIES - 1), (0.001, "#  $     #", 0), (0.1, "#     $  #", 0)],
+)
+def test_planner_looks_from_every_side_before_a_push_that_may_be_deadly(p_dead, ahead, looks):
+    rock = "#" * GRID_SIZE + "\n"
+    state = abstract_states(stack_levels([Level.from_text(
+        rock + "#.   .  .#\n" + "#   $    #\n" + f"{ahead}\n" + "#  @   $ #\n" + 4 * "#        #\n" + rock
+    )]))
+    planner = Doubtful(p_dead).eval()
+    memory = planner.initial_state(np.zeros(1, np.int64)).memory
+    decisions = []
+    for _ in range(SYMMETRIES):
+        decision, memory = planner.decide(state, memory)
+        decisions.append(Instruction(decision[0]))
+    assert decisions[:looks] == [Instruction.STAY] * looks and decisions[looks] == Instruction.NORTH
+    planner.doubt = 1.0
+    assert planner.decide(state, planner.initial_state(np.zeros(1, np.int64)).memory)[0][0] == Instruction.NORTH
+
+
 def test_thoughts_end_where_the_boxes_move():
     states = _states(2)
     thoughts = recall(states, initial_thoughts(2))._replace(views=np.array([5, 5]))
