@@ -98,18 +98,20 @@ def walk_to_push(push: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
 def _spread(value: Tensor, mask: Tensor, decay: Tensor) -> Tensor:
     """Return values [B, P, I, I] after they spread against each direction where mask [B, P, D, I, I] lets them.
 
-    Works in place on a padded board, and on opposite directions at once, since the cost of one decision is that of its
-    many small operations.
+    Works in place on a padded board, and on all directions at once, since the cost of one decision is that of its many
+    small operations.
     """
     board = functional.pad(value, (1, 1, 1, 1))
     here = board[..., 1:-1, 1:-1]
     row, column = board.stride()[2:]
-    # What each cell's northern and southern, western and eastern neighbours hold, as views that follow the board.
-    vertical = board.as_strided((2, *here.shape), (2 * row, *board.stride()), column)
-    lateral = board.as_strided((2, *here.shape), (2 * column, *board.stride()), row)
+    # What each cell's neighbours hold, as a view that follows the board: the four offsets from it are those of a square
+    # that stands on its tip, -row + {0, row - column} + {0, row + column}, hence north, east, west and south.
+    around = board.as_strided((2, 2, *here.shape), (row - column, row + column, *board.stride()), column)
     north, east, south, west = mask.unbind(2)
-    upright, level = torch.stack([north, south]), torch.stack([west, east])
+    masks = torch.stack([north, east, west, south]).unflatten(0, (2, 2))
+    passed, best = torch.empty_like(masks), torch.empty_like(here)
     for _ in range(ITERATIONS):
-        first, second = torch.maximum(torch.minimum(upright, vertical), torch.minimum(level, lateral))
-        torch.maximum(here, torch.maximum(first, second).mul_(decay), out=here)
+        torch.minimum(masks, around, out=passed)
+        torch.amax(passed, (0, 1), out=best)
+        torch.maximum(here, best.mul_(decay), out=here)
     return here.clone()
