@@ -148,22 +148,28 @@ def hesitate(
         doubt: Probability that a push is deadly from which on another look is worth its time.
         perspectives: Views after which there is nothing new to see.
     """
-    rows = np.arange(len(decision))
-    _, cell = state_keys(abstract_state)
+    again = thoughts.views < perspectives
+    if not again.any():
+        return decision
     direction = decision - 1  # -1 is STAY, which pushes nothing
-    ahead = (cell + _STEPS[direction]) % _CELLS
-    pushing = _likely_boxes(abstract_state)[rows, ahead] & (decision != Instruction.STAY)
-    # A box stands in the interior, where `ahead` has its verdict.
-    row, column = np.clip(np.array(divmod(ahead, GRID_SIZE)) - 1, 0, INTERIOR - 1)
-    alive = np.exp(thoughts.push_alive[rows, direction, row, column])
-    again = pushing & (alive < 1.0 - doubt) & (thoughts.views < perspectives)
+    ahead = (likeliest_cells(abstract_state) + _STEPS[direction]) % _CELLS
+    again &= _likely_boxes(abstract_state)[np.arange(len(decision)), ahead] & (decision != Instruction.STAY)
+    rows = np.flatnonzero(again)
+    # Verdicts are those of the interior; an estimate may take the border for a box.
+    row, column = (np.clip(x - 1, 0, INTERIOR - 1) for x in divmod(ahead[rows], GRID_SIZE))
+    again[rows] = np.exp(thoughts.push_alive[rows, direction[rows], row, column]) < 1.0 - doubt
     return np.where(again, Instruction.STAY, decision)
 
 
 def state_keys(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return a hash of (agent's likeliest cell, boxes likelier than not), [M], and that cell, [M]."""
-    cell = abstract_state[..., AGENT].reshape(-1, _CELLS).argmax(1)
-    return _box_keys(abstract_state) ^ _MIX[0][cell], cell.astype(np.int64)
+    cell = likeliest_cells(abstract_state)
+    return _box_keys(abstract_state) ^ _MIX[0][cell], cell
+
+
+def likeliest_cells(abstract_state: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return the flat cell in which the robot is most likely, [M]."""
+    return abstract_state[..., AGENT].reshape(-1, _CELLS).argmax(1).astype(np.int64)
 
 
 def _box_keys(abstract_state: NDArray[np.float32]) -> NDArray[np.int64]:
