@@ -46,12 +46,14 @@ def propagate(planes: Tensor) -> Tensor:
         planes: (floor, target, agent, box) with values in [0, 1], [B, 4, I, I].
     """
     floor, target, agent, box = planes[:, 0], planes[:, TARGET], planes[:, AGENT], planes[:, BOX]
-    free = torch.minimum(floor, 1.0 - box)[:, None].expand(-1, 4, -1, -1)
+    free = torch.minimum(floor, 1.0 - box)
     ahead = shifted(floor)  # Shape [B, D, I, I]
-    push = torch.minimum(torch.minimum(ahead, ahead[:, _OPPOSITE]), floor[:, None])
-    mask = torch.stack([free, free, push], 1)  # Shape [B, P, D, I, I]
-    decay = planes.new_tensor(_DECAY)[:, None, None]
-    return _spread(torch.stack([agent, agent, target], 1), mask, decay)
+    # A box needs room on both sides; what may be pushed north may be pushed south.
+    upright, sideways = (torch.minimum(torch.minimum(ahead[:, d], ahead[:, _OPPOSITE[d]]), floor) for d in (0, 1))
+    decay = planes.new_tensor(_DECAY)[:, None, None, None]
+    start = torch.stack([agent, agent, target])
+    spread = _spread(start, torch.stack([free, free, upright]), torch.stack([free, free, sideways]), decay)
+    return spread.transpose(0, 1)
 
 
 def legal_pushes(planes: Tensor, reachable: Tensor) -> Tensor:
@@ -86,8 +88,7 @@ def walk_to_push(push: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
     # A push in direction d starts in the cell whose neighbour in direction d holds the box.
     boxes = _neighbours(functional.pad(wanted, (1, 1, 1, 1)))
     start = torch.stack([boxes[d][:, d] for d in range(4)], 1)  # Shape [B, D, I, I]
-    mask = free[:, None, None].expand(-1, 1, 4, -1, -1)
-    value = _spread(torch.minimum(start.amax(1), free)[:, None], mask, push.new_tensor(_WALK_DECAY))[:, 0]
+    value = _spread(torch.minimum(start.amax(1), free)[None], free[None], free[None], push.new_tensor(_WALK_DECAY))[0]
     nearness = value.clamp(min=1e-6).log() / -math.log(_WALK_DECAY)
     gain = (shifted(value).clamp(min=1e-6).log() / -math.log(_WALK_DECAY) - nearness[:, None]).clamp(-1.0, 1.0)
     here = agent[:, None]
@@ -95,23 +96,15 @@ def walk_to_push(push: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def _spread(value: Tensor, mask: Tensor, decay: Tensor) -> Tensor:
-    """Return values [B, P, I, I] after they spread against each direction where mask [B, P, D, I, I] lets them.
+def _spread(value: Tensor, upright: Tensor, sideways: Tensor, decay: Tensor) -> Tensor:
+    """Return values [P, B, I, I] after they spread north and south, and east and west, as far as masks let them.
 
-    Works in place on a padded board, and on all directions at once, since the cost of one decision is that of its many
-    small operations.
+    The batch stands where pooling expects channels, so that it runs over contiguous numbers (channels-last): a batch
+    of 128 takes a quarter of the time.
     """
-    board = functional.pad(value, (1, 1, 1, 1))
-    here = board[..., 1:-1, 1:-1]
-    row, column = board.stride()[2:]
-    # What each cell's neighbours hold, as a view that follows the board: the four offsets from it are those of a square
-    # that stands on its tip, -row + {0, row - column} + {0, row + column}, hence north, east, west and south.
-    around = board.as_strided((2, 2, *here.shape), (row - column, row + column, *board.stride()), column)
-    north, east, south, west = mask.unbind(2)
-    masks = torch.stack([north, east, west, south]).unflatten(0, (2, 2))
-    passed, best = torch.empty_like(masks), torch.empty_like(here)
+    value, upright, sideways = (x.contiguous(memory_format=torch.channels_last) for x in (value, upright, sideways))
     for _ in range(ITERATIONS):
-        torch.minimum(masks, around, out=passed)
-        torch.amax(passed, (0, 1), out=best)
-        torch.maximum(here, best.mul_(decay), out=here)
-    return here.clone()
+        vertical = torch.minimum(functional.max_pool2d(value, (3, 1), 1, (1, 0)), upright)
+        horizontal = torch.minimum(functional.max_pool2d(value, (1, 3), 1, (0, 1)), sideways)
+        value = torch.maximum(value, decay * torch.maximum(vertical, horizontal))
+    return value
