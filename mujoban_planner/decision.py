@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mujoban_planner.heads import INTERIOR
 from mujoban_planner.symmetry import SYMMETRIES
-from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, Instruction
+from mujoban_sim.grid import AGENT, BOX, CHANNELS, GRID_SIZE, OFFSETS_RC, Instruction
 
 HISTORY = 256
 """Decisions remembered; an episode has at most 240 s, some 120 moves."""
@@ -43,15 +43,24 @@ _MIX = np.random.default_rng(0).integers(1, 2**62, size=(2, _CELLS), dtype=np.in
 """Zobrist keys of the agent's and the boxes' cells."""
 _STEPS = OFFSETS_RC[1:] @ (GRID_SIZE, 1)
 """What each direction adds to a flat cell, [D]."""
+_INTERIOR_CELL = np.asarray(
+    np.ravel_multi_index(
+        np.clip(np.indices((GRID_SIZE, GRID_SIZE)) - 1, 0, INTERIOR - 1).reshape(2, -1), (INTERIOR, INTERIOR)
+    )
+)
+"""Flat cell of the interior of each flat cell, or the nearest to one of the border, [N * N]."""
+_SLOTS = np.arange(HISTORY)
+_INSTRUCTIONS = len(Instruction)
+_STAY = int(Instruction.STAY)
 
 
 class VisitMemory(NamedTuple):
     """The decisions of an episode so far; a ring of H."""
 
-    keys: NDArray[np.int64]
-    """Hash of the state in which each decision was taken, [M, H]."""
+    boxes: NDArray[np.int64]
+    """Hash of the boxes' arrangement at each decision, [M, H]; -1, which is no hash, where there is none yet."""
     cells: NDArray[np.int64]
-    """Flat cell of the robot at each decision, [M, H]; -1 where there is none yet."""
+    """Flat cell of the robot at each decision, [M, H]; -1 likewise."""
     moves: NDArray[np.int64]
     """Decisions, [M, H]."""
     count: NDArray[np.int64]
@@ -77,7 +86,7 @@ def initial_visits(batch: int) -> VisitMemory:
     """Return the memory of `batch` episodes without a decision."""
     shape = (batch, HISTORY)
     return VisitMemory(
-        np.zeros(shape, np.int64), np.full(shape, -1, np.int64), np.zeros(shape, np.int64), np.zeros(batch, np.int64)
+        np.full(shape, -1, np.int64), np.full(shape, -1, np.int64), np.zeros(shape, np.int64), np.zeros(batch, np.int64)
     )
 
 
@@ -148,23 +157,19 @@ def hesitate(
         doubt: Probability that a push is deadly from which on another look is worth its time.
         perspectives: Views after which there is nothing new to see.
     """
-    again = thoughts.views < perspectives
-    if not again.any():
-        return decision
-    direction = decision - 1  # -1 is STAY, which pushes nothing
-    ahead = (likeliest_cells(abstract_state) + _STEPS[direction]) % _CELLS
-    again &= _likely_boxes(abstract_state)[np.arange(len(decision)), ahead] & (decision != Instruction.STAY)
-    rows = np.flatnonzero(again)
-    # Verdicts are those of the interior; an estimate may take the border for a box.
-    row, column = (np.clip(x - 1, 0, INTERIOR - 1) for x in divmod(ahead[rows], GRID_SIZE))
-    again[rows] = np.exp(thoughts.push_alive[rows, direction[rows], row, column]) < 1.0 - doubt
-    return np.where(again, Instruction.STAY, decision)
+    rows = np.flatnonzero((thoughts.views < perspectives) & (decision != _STAY))
+    direction, states = decision[rows] - 1, abstract_state[rows]
+    ahead = (likeliest_cells(states) + _STEPS[direction]) % _CELLS
+    p_alive = np.exp(thoughts.push_alive.reshape(-1, len(_STEPS), INTERIOR**2)[rows, direction, _INTERIOR_CELL[ahead]])
+    pushes = states.reshape(-1, _CELLS, len(CHANNELS))[np.arange(len(rows)), ahead, BOX] > 0.5
+    decision = decision.copy()
+    decision[rows[pushes & (p_alive < 1.0 - doubt)]] = _STAY
+    return decision
 
 
-def state_keys(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return a hash of (agent's likeliest cell, boxes likelier than not), [M], and that cell, [M]."""
-    cell = likeliest_cells(abstract_state)
-    return _box_keys(abstract_state) ^ _MIX[0][cell], cell
+def state_keys(abstract_state: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return a hash of (agent's likeliest cell, boxes likelier than not), [M]."""
+    return _box_keys(abstract_state) ^ _MIX[0][likeliest_cells(abstract_state)]
 
 
 def likeliest_cells(abstract_state: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -173,8 +178,12 @@ def likeliest_cells(abstract_state: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def _box_keys(abstract_state: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return a hash of the cells in which a box is likelier than not, [M]."""
-    return np.bitwise_xor.reduce(np.where(_likely_boxes(abstract_state), _MIX[1], 0), axis=1)
+    """Return a hash of the cells in which a box is likelier than not, [M]; never negative."""
+    return _hash_boxes(_likely_boxes(abstract_state))
+
+
+def _hash_boxes(is_box: NDArray[np.bool_]) -> NDArray[np.int64]:
+    return np.bitwise_xor.reduce(is_box * _MIX[1], axis=1)
 
 
 def _likely_boxes(abstract_state: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -184,42 +193,44 @@ def _likely_boxes(abstract_state: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 def count_visits(abstract_state: NDArray[np.float32], visits: VisitMemory) -> VisitCounts:
     """Return how often each instruction was tried before in these states, [M, N, N, 4]."""
-    key, cell = state_keys(abstract_state)
-    instructions = np.arange(len(OFFSETS_RC))
-    chosen = visits.moves[:, :, None] == instructions  # Shape [M, H, A]
-    here = (visits.cells == cell[:, None])[:, :, None] & chosen
-    same = (visits.keys == key[:, None])[:, :, None] & here
-    # Walk back from the last decision while the robot was in this cell.
-    back = (visits.count[:, None] - 1 - np.arange(HISTORY)) % HISTORY  # Shape [M, H]
-    recent = np.take_along_axis(here, back[:, :, None], axis=1)
-    staying = np.cumprod(recent.any(2), axis=1).astype(np.bool_)
-    since_arrival = (recent & staying[:, :, None]).sum(1)
-    is_box = _likely_boxes(abstract_state)
-    boxes, known = key ^ _MIX[0][cell], visits.cells >= 0
-    before = visits.keys ^ _MIX[0][visits.cells]
-    tried = _tried_pushes(is_box, known & (before == boxes[:, None]), visits)
-    return VisitCounts(same.sum(1), here.sum(1), since_arrival, tried, _returning_pushes(is_box, boxes, before, known))
+    is_box, cell = _likely_boxes(abstract_state), likeliest_cells(abstract_state)
+    boxes = _hash_boxes(is_box)
+    here, same = visits.cells == cell[:, None], visits.boxes == boxes[:, None]  # Shape [M, H]
+    age = (visits.count[:, None] - 1 - _SLOTS) % HISTORY
+    arrival = np.where(here, HISTORY, age).min(1)  # Age of the last decision elsewhere
+    row, when = here.nonzero()
+    tried = row * _INSTRUCTIONS + visits.moves[row, when]
+
+    def count(which: NDArray[np.bool_] | slice) -> NDArray[np.int64]:
+        return np.bincount(tried[which], minlength=_INSTRUCTIONS * len(cell)).reshape(-1, _INSTRUCTIONS)
+
+    return VisitCounts(
+        count(same[row, when]),
+        count(slice(None)),
+        count(age[row, when] < arrival[row]),
+        _tried_pushes(is_box, same, visits),
+        _returning_pushes(is_box, boxes, visits),
+    )
 
 
 def _tried_pushes(is_box: NDArray[np.bool_], same: NDArray[np.bool_], visits: VisitMemory) -> NDArray[np.float32]:
     """Return `VisitCounts.pushes`: the moves towards a box, [M, N * N], of the decisions `same`, [M, H]."""
-    row, when = np.nonzero(same & (visits.moves != Instruction.STAY))
+    counts = np.zeros((len(is_box), len(_STEPS), _CELLS), np.float32)
+    row, when = (same & (visits.moves != _STAY)).nonzero()
     direction = visits.moves[row, when] - 1
     ahead = (visits.cells[row, when] + _STEPS[direction]) % _CELLS
-    pushed = is_box[row, ahead]
-    counts = np.zeros((len(is_box), len(_STEPS), _CELLS), np.float32)
-    np.add.at(counts, (row[pushed], direction[pushed], ahead[pushed]), 1.0)
+    np.add.at(counts, (row, direction, ahead), is_box[row, ahead])
     return counts.reshape(-1, len(_STEPS), GRID_SIZE, GRID_SIZE)
 
 
 def _returning_pushes(
-    is_box: NDArray[np.bool_], boxes: NDArray[np.int64], before: NDArray[np.int64], known: NDArray[np.bool_]
+    is_box: NDArray[np.bool_], boxes: NDArray[np.int64], visits: VisitMemory
 ) -> NDArray[np.bool_]:
-    """Return `VisitCounts.returns` from the boxes' hash now, [M], and in each decision, [M, H], where there was one."""
-    row, cell = np.nonzero(is_box)
-    after = boxes[row, None] ^ _MIX[1][cell, None] ^ _MIX[1][(cell[:, None] + _STEPS) % _CELLS]  # Shape [X, D]
+    """Return `VisitCounts.returns`, given the hash of the boxes now, [M]."""
+    row, cell = is_box.nonzero()
+    after = (boxes[row] ^ _MIX[1][cell])[:, None] ^ _MIX[1][(cell[:, None] + _STEPS) % _CELLS]  # Shape [X, D]
     returns = np.zeros((len(is_box), len(_STEPS), _CELLS), np.bool_)
-    returns[row, :, cell] = ((after[:, :, None] == before[row, None]) & known[row, None]).any(2)
+    returns[row, :, cell] = (after[:, :, None] == visits.boxes[row, None]).any(2)
     return returns.reshape(-1, len(_STEPS), GRID_SIZE, GRID_SIZE)
 
 
@@ -232,7 +243,7 @@ def visit_penalty(counts: VisitCounts) -> NDArray[np.float64]:
     """Return what is taken off each instruction's log-probability, [M, A]."""
     penalty = STATE_WEIGHT * counts.state + ARRIVAL_WEIGHT * counts.since_arrival
     penalty = penalty + CELL_WEIGHT * np.maximum(counts.cell - CELL_PATIENCE, 0)
-    penalty[:, Instruction.STAY] += STAY_WEIGHT * counts.cell[:, Instruction.STAY]
+    penalty[:, _STAY] += STAY_WEIGHT * counts.cell[:, _STAY]
     return penalty
 
 
@@ -240,8 +251,8 @@ def remember(
     abstract_state: NDArray[np.float32], decision: NDArray[np.int64], visits: VisitMemory
 ) -> VisitMemory:
     """Return the memory after `decision`, [M], was taken in these states."""
-    key, cell = state_keys(abstract_state)
     rows, slot = np.arange(len(decision)), visits.count % HISTORY
-    keys, cells, moves = visits.keys.copy(), visits.cells.copy(), visits.moves.copy()
-    keys[rows, slot], cells[rows, slot], moves[rows, slot] = key, cell, decision
-    return VisitMemory(keys, cells, moves, visits.count + 1)
+    boxes, cells, moves = visits.boxes.copy(), visits.cells.copy(), visits.moves.copy()
+    boxes[rows, slot], cells[rows, slot] = _box_keys(abstract_state), likeliest_cells(abstract_state)
+    moves[rows, slot] = decision
+    return VisitMemory(boxes, cells, moves, visits.count + 1)
