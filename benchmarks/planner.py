@@ -18,7 +18,8 @@ from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.imitation import ImitationConfig, imitation_loss
 from mujoban_planner.lessons import LessonMaker
-from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner
+from mujoban_planner.networks import RecurrentPlanner
+from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import SampleBuffer, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import Teacher

@@ -24,7 +24,7 @@ def load(path: str | Path | None = None, device: str | torch.device = "cpu") -> 
     Raises:
         WeightsError: If the weights are missing, damaged, or of no known architecture.
     """
-    from mujoban_planner.planner import ARCHITECTURES
+    from mujoban_planner.networks import ARCHITECTURES
     from mujoban_rl.weights import WeightsError, load_weights, read_record
 
     weights = Path(path or SHIPPED)

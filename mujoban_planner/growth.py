@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from mujoban_planner import load
-from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner
+from mujoban_planner.networks import RecurrentPlanner
+from mujoban_planner.planner import LearnedPlanner
 from mujoban_rl.weights import WeightsError
 
 _POOLED = "inject.linear.weight"

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner, ResidualPlanner
+from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
+from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
 from mujoban_sim.generator import TEST_SEEDS, generate_batch
 from mujoban_sim.levels import LevelBatch

@@ -6,7 +6,8 @@ import mujoban_planner
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.decision import HISTORY, count_visits, initial_thoughts, initial_visits, recall, remember
 from mujoban_planner.heads import Advice, PlannerHeads
-from mujoban_planner.planner import LearnedPlanner, RecurrentPlanner, ResidualPlanner, input_planes
+from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
+from mujoban_planner.planner import LearnedPlanner, input_planes
 from mujoban_planner.play import play
 from mujoban_planner.propagation import legal_pushes
 from mujoban_planner.symmetry import (

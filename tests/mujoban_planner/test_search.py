@@ -8,7 +8,7 @@ import torch
 from mujoban_planner import evaluate
 from mujoban_planner.boards import abstract_states, bit_boards, take_levels
 from mujoban_planner.lookahead import LookAheadPlanner
-from mujoban_planner.planner import ResidualPlanner
+from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.play import play
 from mujoban_planner.search import search
 from mujoban_sim import rules

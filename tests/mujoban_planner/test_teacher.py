@@ -5,7 +5,8 @@ import torch
 from mujoban_planner import load
 from mujoban_planner.boards import abstract_states, bit_boards, likeliest_boards, state_tensor, take_levels
 from mujoban_planner.lessons import LessonMaker, errs
-from mujoban_planner.planner import ResidualPlanner, input_planes
+from mujoban_planner.networks import ResidualPlanner
+from mujoban_planner.planner import input_planes
 from mujoban_planner.play import play
 from mujoban_planner.propagation import legal_pushes, propagate, walk_to_push
 from mujoban_planner.samples import SampleBuffer, make_batch, unlabelled

@@ -11,7 +11,7 @@ from mujoban_planner import bag_transitions, train
 from mujoban_planner.growth import start_from
 from mujoban_planner.imitation import ImitationConfig, ImitationTrainer, imitation_loss
 from mujoban_planner.lessons import LessonMaker
-from mujoban_planner.planner import RecurrentPlanner, ResidualPlanner
+from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
 from mujoban_planner.reinforcement import LevelStream, MPOConfig, MPOTrainer, reset_stay_logit
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
