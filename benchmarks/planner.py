@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ import tyro
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.boards import abstract_states
+from mujoban_planner.export import export
 from mujoban_planner.imitation import ImitationConfig, imitation_loss
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.networks import RecurrentPlanner
@@ -23,6 +27,7 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import SampleBuffer, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import Teacher
+from mujoban_rl.weights import save_weights
 from mujoban_sim.generator import generate_batch
 
 
@@ -63,6 +68,22 @@ def decision_milliseconds(planner: LearnedPlanner, seconds: float) -> dict[str, 
         times.append(1e3 * (time.perf_counter() - before))
     median, tail = np.percentile(times[5:], [50, 99])
     return {"median_ms": float(median), "p99_ms": float(tail)}
+
+
+def exported(planner: LearnedPlanner) -> LearnedPlanner:
+    """Return the planner with its decision as a graph, as planners that ship have it."""
+    with TemporaryDirectory() as folder:
+        weights = Path(folder) / "planner.safetensors"
+        save_weights(weights, planner, planner.config, {})
+        export(weights)
+        return load(weights)
+
+
+def without_graph(planner: LearnedPlanner) -> LearnedPlanner:
+    """Return a copy that decides in PyTorch."""
+    plain = copy.deepcopy(planner)
+    plain.compiled = None
+    return plain
 
 
 def training_samples_per_second(config: ImitationConfig, options: Options) -> float:
@@ -112,7 +133,8 @@ def main() -> None:
     result: dict[str, Any] = {
         "decision": {
             f"shipped ({type(shipped).__name__})": decision_milliseconds(shipped, options.seconds),
-            "RecurrentPlanner": decision_milliseconds(RecurrentPlanner().eval(), options.seconds),
+            "RecurrentPlanner": decision_milliseconds(exported(RecurrentPlanner()), options.seconds),
+            "shipped, without its graph": decision_milliseconds(without_graph(shipped), options.seconds),
         },
         "training_samples_per_second": {
             "residual 64x8": training_samples_per_second(ImitationConfig(), options),

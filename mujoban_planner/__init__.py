@@ -15,24 +15,28 @@ SHIPPED = Path(__file__).parent / "weights" / "planner.safetensors"
 
 
 def load(path: str | Path | None = None, device: str | torch.device = "cpu") -> LearnedPlanner:
-    """Return a planner with trained weights, of the architecture that their record names.
+    """Return a planner with trained weights, of the architecture in their record, and its graph if there is one.
 
     Args:
         path: A `.safetensors` file with its record beside; the shipped weights by default.
         device: Where the network is put.
 
     Raises:
-        WeightsError: If the weights are missing, damaged, or of no known architecture.
+        WeightsError: If the weights are missing, damaged, or of no known architecture, or their graph is damaged.
     """
+    from mujoban_planner.compiled import CompiledDecision
     from mujoban_planner.networks import ARCHITECTURES
     from mujoban_rl.weights import WeightsError, load_weights, read_record
 
     weights = Path(path or SHIPPED)
-    name = read_record(weights)["class"]
+    record = read_record(weights)
+    name = record["class"]
     if name not in ARCHITECTURES:
         raise WeightsError(f"{weights}: holds weights of {name}, expected one of {', '.join(ARCHITECTURES)}")
     planner = load_weights(ARCHITECTURES[name], weights, device)
     planner.lay_out()
+    if next(planner.parameters()).device.type == "cpu":
+        planner.compiled = CompiledDecision.beside(weights, record["digest"])
     return planner
 
 

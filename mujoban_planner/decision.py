@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mujoban_planner.heads import INTERIOR
 from mujoban_planner.symmetry import SYMMETRIES
@@ -120,21 +121,13 @@ def recall(abstract_state: NDArray[np.float32], thoughts: PushThoughts) -> PushT
     return thoughts._replace(boxes=boxes, views=np.where(boxes == thoughts.boxes, thoughts.views, 0))
 
 
-def ponder(
-    thoughts: PushThoughts, push: NDArray[np.float32], push_alive: NDArray[np.float32], views: int
-) -> PushThoughts:
-    """Return the thoughts after means over so many further views, [M, D, I, I] each.
+def ponder(views: int, seen: Tensor, before: Tensor, now: Tensor) -> Tensor:
+    """Return the mean of a thought, [M, D, I, I], over `seen` views, [M], before and so many further `views` now.
 
     Once every symmetric view was taken, the latest weigh more.
     """
-    known = np.minimum(thoughts.views, SYMMETRIES)
-    share = (views / (known + views)).astype(np.float32)[:, None, None, None]
-    return PushThoughts(
-        thoughts.boxes,
-        thoughts.views + views,
-        np.add(thoughts.push, share * (push - thoughts.push), dtype=np.float32),
-        np.add(thoughts.push_alive, share * (push_alive - thoughts.push_alive), dtype=np.float32),
-    )
+    share = views / (seen.clamp(max=SYMMETRIES).to(now.dtype) + views)
+    return before + share[:, None, None, None] * (now - before)
 
 
 def hesitate(

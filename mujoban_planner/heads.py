@@ -49,6 +49,17 @@ class Advice(NamedTuple):
     """log(1 - p(dead)) of each push, [B, D, I, I]; zeros for a network that does not judge pushes."""
 
 
+class Weighed(NamedTuple):
+    """What comes out of a decision's forward pass."""
+
+    score: Tensor
+    """log pi(A | s) + caution * log(1 - p(dead | s, A)), [B, A]."""
+    push: Tensor
+    """Log-probability of each next push, the mean over the views so far, [B, D, I, I]."""
+    push_alive: Tensor
+    """log(1 - p(dead)) of each push, likewise."""
+
+
 class PlannerHeads(nn.Module):
     """Policy, Q, dead-state, plan-map and push heads, reading the features at the robot's cell and over the board."""
 
@@ -127,4 +138,9 @@ def verdicts(output: PlannerOutput) -> Tensor:
     """Return log(1 - p(dead)) of each push, [B, D, I, I]; zeros where a network does not judge pushes."""
     if output.push_dead is None:
         return torch.zeros_like(output.push)
-    return functional.logsigmoid(-output.push_dead)
+    return log_alive(output.push_dead)
+
+
+def log_alive(dead: Tensor) -> Tensor:
+    """Return log(1 - p(dead)) of logits; as a softplus, which keeps its precision in an exported graph too."""
+    return -functional.softplus(dead)

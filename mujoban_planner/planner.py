@@ -9,7 +9,7 @@ interior alone), C channels, A = 5 instructions, D = 4 directions.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_planner.compiled import CompiledDecision
 from mujoban_planner.decision import (
     PushThoughts,
     VisitCounts,
@@ -31,7 +32,14 @@ from mujoban_planner.decision import (
     remember,
     visit_penalty,
 )
-from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, verdicts
+from mujoban_planner.heads import (
+    Advice,
+    PlannerHeads,
+    PlannerOutput,
+    Weighed,
+    log_alive,
+    verdicts,
+)
 from mujoban_planner.propagation import PLANES, propagate
 from mujoban_sim.grid import CHANNELS, GRID_SIZE
 from mujoban_sim.interfaces import Memory, Planner
@@ -65,6 +73,8 @@ class LearnedPlanner(nn.Module, Planner):
         """Weight of the verdicts on pushes and instructions in a decision; 1 is as trained."""
         self.doubt = DOUBT
         """Probability that a push is deadly from which on the planner looks again before it; 1 is never."""
+        self.compiled: CompiledDecision | None = None
+        """`weigh` for a single robot as an exported graph, of the weights that were loaded."""
 
     @property
     @abstractmethod
@@ -99,6 +109,12 @@ class LearnedPlanner(nn.Module, Planner):
     def inputs(self) -> int:
         """Number of input planes."""
         return len(CHANNELS) + (PLANES if self.propagation else 0)
+
+    def train(self, mode: bool = True) -> Self:
+        """Set training mode, whose new weights the compiled decision would not have."""
+        if mode:
+            self.compiled = None
+        return super().train(mode)
 
     def lay_out(self) -> None:
         """Store convolutions' weights channels-last, as they would rearrange them in every call."""
@@ -142,15 +158,39 @@ class LearnedPlanner(nn.Module, Planner):
             counts: What was tried before.
             thoughts: What was thought before with the boxes where they are.
         """
-        device = next(self.parameters()).device
-        states = torch.from_numpy(np.ascontiguousarray(abstract_state, np.float32)).to(device)
-        advice = self.advise(states, torch.from_numpy(thoughts.views).to(device))
-        thoughts = ponder(thoughts, advice.push.cpu().numpy(), advice.push_alive.cpu().numpy(), self.views)
-        wanted = thoughts.push + np.float32(self.caution) * thoughts.push_alive
-        wanted -= push_penalty(counts)[..., 1:-1, 1:-1]
-        policy = advice.policy + self.heads.guide(torch.from_numpy(wanted).to(device), input_planes(states))
-        score = functional.log_softmax(policy, 1) + self.caution * advice.alive
-        return score.double().cpu().numpy() - visit_penalty(counts), thoughts
+        penalty = push_penalty(counts)[..., 1:-1, 1:-1]
+        inputs = (abstract_state, thoughts.views, thoughts.push, thoughts.push_alive, penalty, np.array(self.caution))
+        inputs = [np.ascontiguousarray(x, np.int64 if x.dtype.kind == "i" else np.float32) for x in inputs]
+        if self.compiled is not None and len(abstract_state) == self.thinking == 1:
+            score, push, push_alive = self.compiled(inputs)
+        else:
+            device = next(self.parameters()).device
+            weighed = self.weigh(*(torch.from_numpy(x).to(device) for x in inputs))
+            score, push, push_alive = (x.cpu().numpy() for x in weighed)
+        thoughts = PushThoughts(thoughts.boxes, thoughts.views + self.views, push, push_alive)
+        return score.astype(np.float64) - visit_penalty(counts), thoughts
+
+    def weigh(
+        self, states: Tensor, seen: Tensor, push: Tensor, push_alive: Tensor, penalty: Tensor, caution: Tensor
+    ) -> Weighed:
+        """Return the scores of the instructions, but for what was tried, and thoughts: one forward pass.
+
+        It is what `mujoban_planner.export` exports, hence tensors alone.
+
+        Args:
+            states: [B, N, N, 4].
+            seen: Views of each state's boxes that were taken before, int64 [B].
+            push: Log-probability of each next push, the mean over these views, [B, D, I, I].
+            push_alive: log(1 - p(dead)) of each push, likewise.
+            penalty: What is taken off the log-probability of each push that is wanted, [B, D, I, I].
+            caution: Weight of the verdicts, [].
+        """
+        advice = self.advise(states, seen)
+        push = ponder(self.views, seen, push, advice.push)
+        push_alive = ponder(self.views, seen, push_alive, advice.push_alive)
+        wanted = push + caution * push_alive - penalty
+        policy = advice.policy + self.heads.guide(wanted, input_planes(states))
+        return Weighed(functional.log_softmax(policy, 1) + caution * advice.alive, push, push_alive)
 
     @property
     def views(self) -> int:
@@ -171,7 +211,7 @@ class LearnedPlanner(nn.Module, Planner):
         """
         del seen  # a network that takes the board as it is
         output, _ = self.read(states)
-        return Advice(output.policy, functional.logsigmoid(-output.dead), output.push, verdicts(output))
+        return Advice(output.policy, log_alive(output.dead), output.push, verdicts(output))
 
 
 def split_memory(memory: Memory) -> tuple[VisitMemory, PushThoughts]:

@@ -1,0 +1,101 @@
+"""Export a planner's decision as an ONNX graph: `python -m mujoban_planner.export [WEIGHTS]`.
+
+The graph lies beside the weights and makes the decision of one robot faster (`compiled`). Any other ONNX runtime can
+run it too: it holds the weights, takes `compiled.INPUTS` and returns `compiled.OUTPUTS`, with a batch of one.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from torch import Tensor, nn
+
+from mujoban_planner import SHIPPED, load
+from mujoban_planner.compiled import DIGEST, INPUTS, OUTPUTS, CompiledDecision, graph_path
+from mujoban_planner.heads import INTERIOR, Weighed
+from mujoban_planner.planner import LearnedPlanner
+from mujoban_rl.weights import WeightsError, digest, write_atomically
+from mujoban_sim.grid import CHANNELS, GRID_SIZE, Instruction
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which planner to export."""
+
+    weights: Annotated[Path, tyro.conf.Positional] = SHIPPED
+    """A `.safetensors` file with its record beside."""
+
+
+class _Decision(nn.Module):
+    """`LearnedPlanner.weigh` as a module."""
+
+    def __init__(self, planner: LearnedPlanner) -> None:
+        super().__init__()
+        self.planner = planner
+
+    def forward(self, *inputs: Tensor) -> Weighed:
+        return self.planner.weigh(*inputs)
+
+
+def export(weights: Path) -> Path:
+    """Write the graph of a weights file beside it, and return where.
+
+    Raises:
+        WeightsError: If the weights are missing or damaged.
+        ModuleNotFoundError: If `onnxscript` is not installed, which only exporting needs.
+    """
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    program = torch.onnx.export(
+        _Decision(load(weights)).eval(),
+        example_inputs(),
+        dynamo=True,
+        input_names=INPUTS,
+        output_names=OUTPUTS,
+        verbose=False,
+    )
+    assert program is not None
+    model = program.model
+    _strip(model.graph.all_nodes())
+    _strip([model, model.graph, *model.graph.inputs, *model.graph.outputs, *model.graph.initializers.values()])
+    model.metadata_props[DIGEST] = digest(weights)
+    path = graph_path(weights)
+    write_atomically(path, program.model_proto.SerializeToString())
+    return path
+
+
+def example_inputs() -> tuple[Tensor, ...]:
+    """Return inputs of the shapes that the graph takes."""
+    board = torch.zeros(1, len(Instruction) - 1, INTERIOR, INTERIOR)
+    states = torch.zeros(1, GRID_SIZE, GRID_SIZE, len(CHANNELS))
+    return states, torch.zeros(1, dtype=torch.int64), board, board.clone(), board.clone(), torch.tensor(1.0)
+
+
+def _strip(parts: Iterable[Any]) -> None:
+    """Forget where in the source each part comes from, which names folders of this machine."""
+    for part in parts:
+        part.metadata_props.clear()
+        part.doc_string = None
+
+
+def main() -> int:
+    """Export, and say where the graph is."""
+    options = tyro.cli(Options, description=__doc__)
+    try:
+        path = export(options.weights)
+    except (WeightsError, ModuleNotFoundError) as error:
+        print(f"export: error: {error}", file=sys.stderr)
+        return 2
+    CompiledDecision(path)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

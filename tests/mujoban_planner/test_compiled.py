@@ -1,0 +1,114 @@
+import copy
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+import mujoban_planner
+from mujoban_planner.boards import abstract_states
+from mujoban_planner.compiled import graph_path
+from mujoban_planner.decision import count_visits, initial_thoughts, initial_visits
+from mujoban_planner.export import export
+from mujoban_planner.networks import RecurrentPlanner
+from mujoban_planner.play import play
+from mujoban_rl.weights import WeightsError, save_weights
+from mujoban_sim.generator import generate_batch
+
+LEVELS = generate_batch(5, range(1000, 1004))
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Folder with the weights of a small planner, their record and graph."""
+    torch.manual_seed(0)
+    planner = RecurrentPlanner(4, 1, 1)
+    folder = tmp_path_factory.mktemp("exported")
+    save_weights(folder / "small.safetensors", planner, planner.config, {})
+    export(folder / "small.safetensors")
+    return folder
+
+
+@pytest.fixture
+def small(exported, tmp_path):
+    return shutil.copytree(exported, tmp_path / "copy") / "small.safetensors"
+
+
+def _scores(planner, states):
+    return planner.scores(states, count_visits(states, initial_visits(1)), initial_thoughts(1))[0]
+
+
+def test_shipped_planner_decides_in_its_graph_as_in_pytorch():
+    compiled, plain = mujoban_planner.load(), mujoban_planner.load()
+    assert compiled.compiled is not None
+    plain.compiled = None
+    rng = np.random.default_rng(0)
+    for state in abstract_states(LEVELS):
+        blurred = np.clip(state + rng.normal(0.0, 0.1, state.shape), 0, 1).astype(np.float32)[None]
+        a, b = (p.initial_state(np.zeros(1, np.int64)).memory for p in (compiled, plain))
+        for _ in range(10):  # The memory turns the board and weighs what was tried
+            (decision, a), (expected, b) = compiled.decide(blurred, a), plain.decide(blurred, b)
+            assert decision == expected
+            assert all(np.allclose(x, y, atol=0.05, rtol=1e-4) for x, y in zip(a, b, strict=True))
+
+
+def test_shipped_graph_solves_levels_one_by_one():
+    planner = mujoban_planner.load()
+    alone = [play(planner, generate_batch(3, [seed])).solved[0] for seed in range(1000, 1004)]
+    assert alone == [True] * 4
+
+
+def test_an_exported_planner_decides_as_before(small):
+    exported = mujoban_planner.load(small)
+    graph_path(small).unlink()
+    bare = mujoban_planner.load(small)
+    assert exported.compiled is not None and bare.compiled is None
+    for state in abstract_states(LEVELS):
+        assert np.allclose(_scores(exported, state[None]), _scores(bare, state[None]), atol=1e-4)
+
+
+def test_a_graph_bears_no_trace_of_the_machine(small):
+    content = graph_path(small).read_bytes()
+    assert b".py" not in content and b"/mujoban" not in content
+
+
+def test_a_graph_of_other_weights_is_not_used(small):
+    with torch.no_grad():
+        other = RecurrentPlanner(4, 1, 1)
+    save_weights(small, other, other.config, {})
+    with pytest.warns(UserWarning, match=r"small\.onnx: a graph of other weights .*mujoban_planner\.export"):
+        planner = mujoban_planner.load(small)
+    state = abstract_states(LEVELS)[:1]
+    assert np.allclose(_scores(planner, state), _scores(other.eval(), state), atol=1e-5)
+
+
+def test_weights_that_were_trained_on_are_not_decided_with_in_the_old_graph(small):
+    planner = mujoban_planner.load(small)
+    state = abstract_states(LEVELS)[:1]
+    before = _scores(planner, state)
+    planner.train()
+    with torch.no_grad():
+        for weight in planner.parameters():
+            weight += 0.1
+    assert not np.allclose(_scores(planner.eval(), state), before, atol=1e-2)
+
+
+def test_more_thinking_time_is_not_that_of_the_graph(small):
+    planner = mujoban_planner.load(small)
+    state = abstract_states(LEVELS)[:1]
+    before = _scores(planner, state)
+    planner.thinking = 4
+    assert not np.allclose(_scores(planner, state), before, atol=1e-3)
+
+
+def test_a_copy_has_the_graph_as_well(small):
+    planner = mujoban_planner.load(small)
+    state = abstract_states(LEVELS)[:1]
+    twin = copy.deepcopy(planner)
+    assert twin.compiled is not None and np.array_equal(_scores(twin, state), _scores(planner, state))
+
+
+def test_what_is_no_graph_of_a_decision_is_named(small):
+    graph_path(small).write_bytes(b"no graph")
+    with pytest.raises(WeightsError, match=r"small\.onnx: no graph .*mujoban_planner\.export"):
+        mujoban_planner.load(small)
