@@ -134,6 +134,7 @@ def hesitate(
     abstract_state: NDArray[np.float32],
     decision: NDArray[np.int64],
     thoughts: PushThoughts,
+    counts: VisitCounts,
     *,
     doubt: float,
     perspectives: int,
@@ -147,10 +148,13 @@ def hesitate(
         abstract_state: [M, N, N, 4].
         decision: The decisions so far, [M].
         thoughts: What was thought of the pushes, these decisions included.
+        counts: What was tried before. Where estimates flicker, thoughts end with the boxes that they were about, so
+            that the decisions to stay in a cell are bounded as well.
         doubt: Probability that a push is deadly from which on another look is worth its time.
         perspectives: Views after which there is nothing new to see.
     """
-    rows = np.flatnonzero((thoughts.views < perspectives) & (decision != _STAY))
+    again = (thoughts.views < perspectives) & (counts.since_arrival[:, _STAY] < perspectives)
+    rows = np.flatnonzero(again & (decision != _STAY))
     direction, states = decision[rows] - 1, abstract_state[rows]
     ahead = (likeliest_cells(states) + _STEPS[direction]) % _CELLS
     p_alive = np.exp(thoughts.push_alive.reshape(-1, len(_STEPS), INTERIOR**2)[rows, direction, _INTERIOR_CELL[ahead]])

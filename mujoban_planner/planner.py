@@ -145,7 +145,10 @@ class LearnedPlanner(nn.Module, Planner):
         """Return the instruction of the highest score, or STAY to look again first, [M], and thoughts; see `scores`."""
         scores, thoughts = self.scores(abstract_state, counts, thoughts)
         best = np.argmax(scores, axis=1)
-        return hesitate(abstract_state, best, thoughts, doubt=self.doubt, perspectives=self.perspectives), thoughts
+        decision = hesitate(
+            abstract_state, best, thoughts, counts, doubt=self.doubt, perspectives=self.perspectives
+        )
+        return decision, thoughts
 
     @torch.inference_mode()
     def scores(

@@ -304,6 +304,23 @@ def test_planner_looks_from_every_side_before_a_push_that_may_be_deadly(p_dead, 
     assert planner.decide(state, planner.initial_state(np.zeros(1, np.int64)).memory)[0][0] == Instruction.NORTH
 
 
+def test_planner_does_not_hesitate_for_ever_where_estimates_flicker():
+    rock = "#" * GRID_SIZE + "\n"
+    states = [
+        abstract_states(stack_levels([Level.from_text(
+            rock + "#.   .  .#\n" + f"#  {far}#\n" + "#  $     #\n" + "#  @   $ #\n" + 4 * "#        #\n" + rock
+        )]))
+        for far in ("$     ", " $    ")
+    ]
+    planner = Doubtful(0.1).eval()
+    memory = planner.initial_state(np.zeros(1, np.int64)).memory
+    decisions = []
+    for k in range(12):
+        decision, memory = planner.decide(states[k % 2], memory)
+        decisions.append(Instruction(decision[0]))
+    assert decisions == [Instruction.STAY] * SYMMETRIES + [Instruction.NORTH] * 4
+
+
 def test_thoughts_end_where_the_boxes_move():
     states = _states(2)
     thoughts = recall(states, initial_thoughts(2))._replace(views=np.array([5, 5]))
