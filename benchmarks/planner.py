@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -71,7 +72,9 @@ def decision_milliseconds(planner: LearnedPlanner, seconds: float) -> dict[str, 
 
 
 def exported(planner: LearnedPlanner) -> LearnedPlanner:
-    """Return the planner with its decision as a graph, as planners that ship have it."""
+    """Return the planner with its decision as a graph, as planners that ship have it, where this can be exported."""
+    if find_spec("onnxscript") is None:
+        return planner.eval()
     with TemporaryDirectory() as folder:
         weights = Path(folder) / "planner.safetensors"
         save_weights(weights, planner, planner.config, {})
