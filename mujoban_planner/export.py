@@ -10,6 +10,7 @@ import logging
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -51,6 +52,8 @@ def export(weights: Path) -> Path:
         WeightsError: If the weights are missing or damaged.
         ModuleNotFoundError: If `onnxscript` is not installed, which only exporting needs.
     """
+    if find_spec("onnxscript") is None:
+        raise ModuleNotFoundError("exporting needs onnxscript, which is part of mujoban[dev]: pip install onnxscript")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     program = torch.onnx.export(
         _Decision(load(weights)).eval(),

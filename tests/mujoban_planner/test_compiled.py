@@ -9,7 +9,7 @@ import mujoban_planner
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.compiled import graph_path
 from mujoban_planner.decision import count_visits, initial_thoughts, initial_visits
-from mujoban_planner.export import export
+from mujoban_planner.export import export, main
 from mujoban_planner.networks import RecurrentPlanner
 from mujoban_planner.play import play
 from mujoban_rl.weights import WeightsError, save_weights
@@ -112,3 +112,10 @@ def test_what_is_no_graph_of_a_decision_is_named(small):
     graph_path(small).write_bytes(b"no graph")
     with pytest.raises(WeightsError, match=r"small\.onnx: no graph .*mujoban_planner\.export"):
         mujoban_planner.load(small)
+
+
+def test_export_of_missing_weights_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["export", str(tmp_path / "none.safetensors")])
+    assert main() == 2
+    error = capsys.readouterr().err
+    assert error.startswith("export: error: ") and "none" in error and error.count("\n") == 1
