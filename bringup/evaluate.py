@@ -32,19 +32,28 @@ PROG = "evaluate.py"
 
 
 class SolvedBar(Progress):
-    """Progress bar on stderr: how many episodes have ended, and how many of these were solved."""
+    """How many episodes have ended, and how many of these were solved: a bar on stderr, or lines without a terminal."""
 
     def __init__(self, total: int, *, disable: bool = False) -> None:
         """Count to `total` episodes."""
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         super().__init__(*columns, console=Console(stderr=True), disable=disable)
         self._task = self.add_task("solved", total=total)
+        self._total, self._printed = total, 0
 
     def show(self, results: Sequence[EpisodeResult]) -> None:
         """Show the outcomes so far."""
         if results:
             share = sum(result.solved for result in results) / len(results)
             self.update(self._task, completed=len(results), description=f"solved {100 * share:4.1f} %")
+            self._print(len(results), share)
+
+    def _print(self, ended: int, share: float) -> None:
+        """Print a line whenever another tenth has ended, in a log, which shows a bar only when it is full."""
+        if self.disable or self.console.is_terminal or 10 * (ended - self._printed) < self._total:
+            return
+        self._printed = ended
+        self.console.print(f"{ended} of {self._total} episodes, solved {100 * share:.1f} %")
 
 
 def evaluate(
