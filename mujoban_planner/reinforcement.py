@@ -119,7 +119,9 @@ class MPOTrainer:
         self.directory = RunDirectory(directory, asdict(config) | {"init": self.init})
         torch.manual_seed(config.seed)  # the initial weights
         self.network = (init or config.build()).to(self.device).train()
-        if init is not None:
+        if init is None:
+            mute_verdicts(self.network)
+        else:
             reset_stay_logit(self.network)
         self.target = copy.deepcopy(self.network).eval()
         self.mpo = DiscreteMPO(config.mpo).to(self.device)
@@ -278,6 +280,17 @@ class MPOTrainer:
         rates = solve_rates(self.target, reduced_precision=self.device.type == "cpu")
         log.message(f"{self.updates:8d} updates {self.env_steps:10d} steps  {rates}")
         return rates | {"env_steps": float(self.env_steps), "seconds": self.seconds}
+
+
+@torch.no_grad()
+def mute_verdicts(network: LearnedPlanner) -> None:
+    """Let a network that will never be taught what is deadly call nothing so; a decision weighs these verdicts."""
+    heads = network.heads
+    verdicts = [heads.dead] if heads.push_dead is None else [heads.dead, heads.push_dead[-1]]
+    for head in verdicts:
+        assert isinstance(head, nn.Linear | nn.Conv2d) and head.bias is not None
+        nn.init.zeros_(head.weight)
+        nn.init.constant_(head.bias, -20.0)
 
 
 @torch.no_grad()

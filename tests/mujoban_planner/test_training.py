@@ -8,6 +8,8 @@ import torch
 
 import mujoban_planner
 from mujoban_planner import bag_transitions, train
+from mujoban_planner.boards import abstract_states
+from mujoban_planner.decision import count_visits, initial_thoughts, initial_visits
 from mujoban_planner.growth import start_from
 from mujoban_planner.imitation import ImitationConfig, ImitationTrainer, imitation_loss
 from mujoban_planner.lessons import LessonMaker
@@ -16,7 +18,7 @@ from mujoban_planner.reinforcement import LevelStream, MPOConfig, MPOTrainer, re
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_rl.weights import WeightsError, save_weights
-from mujoban_sim.generator import TRAIN_SEEDS
+from mujoban_sim.generator import TRAIN_SEEDS, generate_batch
 from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
 
 SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
@@ -110,6 +112,18 @@ def test_mpo_resumes_and_writes_a_loadable_planner(tmp_path):
         trainer.run(seconds=None, updates=updates, evaluate_every=math.inf, save_every=math.inf)
         assert trainer.updates == updates
     assert mujoban_planner.load(tmp_path / "planner.safetensors").config["channels"] == 8
+
+
+@pytest.mark.parametrize("propagation", [True, False])
+def test_a_planner_by_mpo_alone_is_not_led_by_verdicts_that_nobody_taught_it(tmp_path, propagation):
+    config = MPOConfig(channels=8, blocks=1, environments=8, warm_up_steps=8, propagation=propagation)
+    planner = MPOTrainer(config, tmp_path).network.eval()
+    states = abstract_states(generate_batch(3, range(1000, 1016)))
+    scores = []
+    for caution in (0.0, 4.0):
+        planner.caution = caution
+        scores.append(planner.scores(states, count_visits(states, initial_visits(16)), initial_thoughts(16))[0])
+    assert np.allclose(*scores, atol=1e-5)
 
 
 def test_mpo_after_imitation_gives_stay_a_chance():
