@@ -9,8 +9,6 @@ Shapes: B states, I = 8 rows and columns of the interior, C channels.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -46,21 +44,10 @@ class ResidualPlanner(LearnedPlanner):
 
     def __init__(self, channels: int = 64, blocks: int = 8, propagation: bool = True, judge: bool = False) -> None:
         """Build `blocks` residual blocks of `channels` channels."""
-        super().__init__(propagation=propagation)
-        self._config = {"channels": channels, "blocks": blocks, "propagation": propagation, "judge": judge}
+        super().__init__(channels=channels, blocks=blocks, propagation=propagation, judge=judge)
         self.encoder = nn.Conv2d(self.inputs, channels, 3, padding=1)
         self.blocks = nn.Sequential(*(ResidualBlock(channels) for _ in range(blocks)))
         self.readout = PlannerHeads(channels, propagation=propagation, judge=judge)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Keyword arguments that rebuild the module."""
-        return dict(self._config)
-
-    @property
-    def heads(self) -> PlannerHeads:
-        """The read-out."""
-        return self.readout
 
     def features(self, planes: Tensor) -> Tensor:
         """Return features [B, C, I, I] of planes [B, `inputs`, I, I]."""
@@ -138,9 +125,7 @@ class RecurrentPlanner(LearnedPlanner):
         judge: bool = False,
     ) -> None:
         """Build DRC(depth, repeats) with `channels` channels."""
-        super().__init__(propagation=propagation)
-        self._config = {"channels": channels, "depth": depth, "repeats": repeats}
-        self._config |= {"propagation": propagation, "judge": judge}
+        super().__init__(channels=channels, depth=depth, repeats=repeats, propagation=propagation, judge=judge)
         self.repeats = repeats
         self.encoder = nn.Sequential(
             nn.Conv2d(self.inputs, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, channels, 3, padding=1)
@@ -148,16 +133,6 @@ class RecurrentPlanner(LearnedPlanner):
         self.cells = nn.ModuleList([ConvLSTMCell(channels) for _ in range(depth)])
         self.initial = nn.Parameter(torch.zeros(depth, 2, channels, INTERIOR, INTERIOR))
         self.readout = PlannerHeads(channels, propagation=propagation, judge=judge)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Keyword arguments that rebuild the module."""
-        return dict(self._config)
-
-    @property
-    def heads(self) -> PlannerHeads:
-        """The read-out."""
-        return self.readout
 
     def features(self, planes: Tensor) -> Tensor:
         """Return features [B, C, I, I] of planes [B, `inputs`, I, I]."""

@@ -32,22 +32,13 @@ from mujoban_planner.decision import (
     remember,
     visit_penalty,
 )
-from mujoban_planner.heads import (
-    Advice,
-    PlannerHeads,
-    PlannerOutput,
-    Weighed,
-    log_alive,
-    verdicts,
-)
+from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, Weighed, log_alive, verdicts
 from mujoban_planner.propagation import PLANES, propagate
 from mujoban_sim.grid import CHANNELS, GRID_SIZE
 from mujoban_sim.interfaces import Memory, Planner
 
 CAUTION = 4.0
 """Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/planner.md)."""
-
-
 DOUBT = 0.02
 """Probability that a push is deadly from which on the planner looks again before it, by default (docs/planner.md)."""
 
@@ -63,9 +54,18 @@ class LearnedPlanner(nn.Module, Planner):
     memory.
     """
 
-    def __init__(self, *, propagation: bool) -> None:
-        """Take the planes of `propagation.propagate` as further inputs if `propagation`."""
+    readout: PlannerHeads
+    """Set by each architecture, after what comes before it in the network."""
+
+    def __init__(self, *, propagation: bool, **config: Any) -> None:
+        """Take the planes of `propagation.propagate` as further inputs if `propagation`.
+
+        Args:
+            propagation: Whether it does.
+            config: The other keyword arguments that rebuild the module.
+        """
         super().__init__()
+        self._config = {**config, "propagation": propagation}
         self.propagation = propagation
         self.thinking = 1
         """Thinking time: repeats of the recurrent core, or symmetric views, per decision; 1 is as trained."""
@@ -77,18 +77,18 @@ class LearnedPlanner(nn.Module, Planner):
         """`weigh` for a single robot as an exported graph, of the weights that were loaded."""
 
     @property
-    @abstractmethod
     def config(self) -> dict[str, Any]:
         """Keyword arguments that rebuild the module."""
+        return dict(self._config)
 
     @abstractmethod
     def features(self, planes: Tensor) -> Tensor:
         """Return features [B, C, I, I] of the network's input planes, [B, `inputs`, I, I]."""
 
     @property
-    @abstractmethod
     def heads(self) -> PlannerHeads:
         """The read-out."""
+        return self.readout
 
     def forward(self, abstract_state: Tensor) -> PlannerOutput:
         """Return the heads' outputs for abstract states, float [B, N, N, 4] with values in [0, 1]."""
