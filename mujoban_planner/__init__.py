@@ -14,12 +14,15 @@ SHIPPED = Path(__file__).parent / "weights" / "planner.safetensors"
 """The weights that ship."""
 
 
-def load(path: str | Path | None = None, device: str | torch.device = "cpu") -> LearnedPlanner:
+def load(
+    path: str | Path | None = None, device: str | torch.device = "cpu", *, compiled: bool = True
+) -> LearnedPlanner:
     """Return a planner with trained weights, of the architecture in their record, and its graph if there is one.
 
     Args:
         path: A `.safetensors` file with its record beside; the shipped weights by default.
         device: Where the network is put.
+        compiled: Whether to look for a graph, which only decisions of single robots on a CPU need.
 
     Raises:
         WeightsError: If the weights are missing, damaged, or of no known architecture, or their graph is damaged.
@@ -35,7 +38,7 @@ def load(path: str | Path | None = None, device: str | torch.device = "cpu") -> 
         raise WeightsError(f"{weights}: holds weights of {name}, expected one of {', '.join(ARCHITECTURES)}")
     planner = load_weights(ARCHITECTURES[name], weights, device)
     planner.lay_out()
-    if next(planner.parameters()).device.type == "cpu":
+    if compiled and next(planner.parameters()).device.type == "cpu":
         planner.compiled = CompiledDecision.beside(weights, record["digest"])
     return planner
 

@@ -70,14 +70,9 @@ class CompiledDecision:
         """Return `OUTPUTS` of `INPUTS`, arrays as `LearnedPlanner.weigh` takes them, of one state."""
         return self._session.run(OUTPUTS, dict(zip(INPUTS, inputs, strict=True)))
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the path; a session can neither be copied nor sent to another process."""
-        return {"path": self.path}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Compile again."""
-        self.path = state["path"]
-        self._session = _start(self.path)
+    def __reduce__(self) -> tuple[type[CompiledDecision], tuple[Path]]:
+        """Compile again where it is copied or sent to another process, as a session can be neither."""
+        return type(self), (self.path,)
 
 
 def graph_path(weights: Path) -> Path:

@@ -19,7 +19,7 @@ import tyro
 from torch import Tensor, nn
 
 from mujoban_planner import SHIPPED, load
-from mujoban_planner.compiled import DIGEST, INPUTS, OUTPUTS, CompiledDecision, graph_path
+from mujoban_planner.compiled import DIGEST, INPUTS, OUTPUTS, graph_path
 from mujoban_planner.heads import INTERIOR, Weighed
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_rl.weights import WeightsError, digest, write_atomically
@@ -56,7 +56,7 @@ def export(weights: Path) -> Path:
         raise ModuleNotFoundError("exporting needs onnxscript, which is part of mujoban[dev]: pip install onnxscript")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     program = torch.onnx.export(
-        _Decision(load(weights)).eval(),
+        _Decision(load(weights, compiled=False)).eval(),
         example_inputs(),
         dynamo=True,
         input_names=INPUTS,
@@ -95,7 +95,6 @@ def main() -> int:
     except (WeightsError, ModuleNotFoundError) as error:
         print(f"export: error: {error}", file=sys.stderr)
         return 2
-    CompiledDecision(path)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     return 0
 

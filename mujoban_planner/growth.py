@@ -27,7 +27,7 @@ def start_from(network: LearnedPlanner, path: Path) -> None:
         WeightsError: If the file is damaged, or its planner has another architecture, or more channels or blocks, or is
             a smaller recurrent one, whose gates cannot grow.
     """
-    trained = load(path)
+    trained = load(path, compiled=False)
     ours, theirs = dict(network.named_parameters()), dict(trained.named_parameters())
     fits = type(trained) is type(network) and all(k in ours and _holds(ours[k], v) for k, v in theirs.items())
     if isinstance(network, RecurrentPlanner):

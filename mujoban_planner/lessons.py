@@ -260,7 +260,7 @@ def _make_lessons(
         elif not corrections.full() and weights.exists():
             if (found := weights.stat().st_mtime) != version:
                 try:
-                    planner, version = load(weights), found
+                    planner, version = load(weights, compiled=False), found
                 except WeightsError:  # caught between the two files of a newer version: try again
                     continue
             if planner is not None:

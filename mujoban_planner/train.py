@@ -75,7 +75,7 @@ class MPO:
     def main(self) -> None:
         """Train."""
         torch.set_num_threads(self.threads)
-        init = load(self.init, self.device) if self.init is not None else None
+        init = load(self.init, self.device, compiled=False) if self.init is not None else None
         trainer = MPOTrainer(
             self.config, self.run, device=self.device, init=init, init_path=self.init, bags=self.bags
         )

@@ -114,6 +114,13 @@ def test_what_is_no_graph_of_a_decision_is_named(small):
         mujoban_planner.load(small)
 
 
+def test_an_export_takes_the_place_of_a_damaged_graph(small, recwarn):
+    graph_path(small).write_bytes(b"no graph")
+    export(small)
+    assert mujoban_planner.load(small).compiled is not None
+    assert not [w for w in recwarn if "other weights" in str(w.message)]
+
+
 def test_export_of_missing_weights_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["export", str(tmp_path / "none.safetensors")])
     assert main() == 2
