@@ -45,15 +45,16 @@ class SolvedBar(Progress):
         """Show the outcomes so far."""
         if results:
             share = sum(result.solved for result in results) / len(results)
-            self.update(self._task, completed=len(results), description=f"solved {100 * share:4.1f} %")
-            self._print(len(results), share)
+            solved = f"solved {100 * share:4.1f} %"
+            self.update(self._task, completed=len(results), description=solved)
+            self._print(len(results), solved)
 
-    def _print(self, ended: int, share: float) -> None:
+    def _print(self, ended: int, solved: str) -> None:
         """Print a line whenever another tenth has ended, in a log, which shows a bar only when it is full."""
         if self.disable or self.console.is_terminal or 10 * (ended - self._printed) < self._total:
             return
         self._printed = ended
-        self.console.print(f"{ended} of {self._total} episodes, solved {100 * share:.1f} %")
+        self.console.print(f"{ended} of {self._total} episodes, {solved}")
 
 
 def evaluate(
