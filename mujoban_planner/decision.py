@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_planner.heads import INTERIOR
+from mujoban_planner.heads import INSTRUCTIONS, INTERIOR
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_sim.grid import AGENT, BOX, CHANNELS, GRID_SIZE, OFFSETS_RC, Instruction
 
@@ -51,7 +51,6 @@ _INTERIOR_CELL = np.asarray(
 )
 """Flat cell of the interior of each flat cell, or the nearest to one of the border, [N * N]."""
 _SLOTS = np.arange(HISTORY)
-_INSTRUCTIONS = len(Instruction)
 _STAY = int(Instruction.STAY)
 
 
@@ -196,10 +195,10 @@ def count_visits(abstract_state: NDArray[np.float32], visits: VisitMemory) -> Vi
     age = (visits.count[:, None] - 1 - _SLOTS) % HISTORY
     arrival = np.where(here, HISTORY, age).min(1)  # Age of the last decision elsewhere
     row, when = here.nonzero()
-    tried = row * _INSTRUCTIONS + visits.moves[row, when]
+    tried = row * INSTRUCTIONS + visits.moves[row, when]
 
     def count(which: NDArray[np.bool_] | slice) -> NDArray[np.int64]:
-        return np.bincount(tried[which], minlength=_INSTRUCTIONS * len(cell)).reshape(-1, _INSTRUCTIONS)
+        return np.bincount(tried[which], minlength=INSTRUCTIONS * len(cell)).reshape(-1, INSTRUCTIONS)
 
     return VisitCounts(
         count(same[row, when]),

@@ -20,10 +20,10 @@ from torch import Tensor, nn
 
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.compiled import DIGEST, INPUTS, OUTPUTS, graph_path
-from mujoban_planner.heads import INTERIOR, Weighed
+from mujoban_planner.heads import INSTRUCTIONS, INTERIOR, Weighed
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_rl.weights import WeightsError, digest, write_atomically
-from mujoban_sim.grid import CHANNELS, GRID_SIZE, Instruction
+from mujoban_sim.grid import CHANNELS, GRID_SIZE
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def export(weights: Path) -> Path:
 
 def example_inputs() -> tuple[Tensor, ...]:
     """Return inputs of the shapes that the graph takes."""
-    board = torch.zeros(1, len(Instruction) - 1, INTERIOR, INTERIOR)
+    board = torch.zeros(1, INSTRUCTIONS - 1, INTERIOR, INTERIOR)
     states = torch.zeros(1, GRID_SIZE, GRID_SIZE, len(CHANNELS))
     return states, torch.zeros(1, dtype=torch.int64), board, board.clone(), board.clone(), torch.tensor(1.0)
 

@@ -31,8 +31,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return [B, C, I, I] from [B, C, I, I]."""
-        h = _convolve(self.first, torch.relu(x))
-        return x + _convolve(self.second, torch.relu(h + self.inject(h)))
+        h = self.first(functional.relu(x))
+        return x + self.second(functional.relu(h + self.inject(h)))
 
 
 class ResidualPlanner(LearnedPlanner):
@@ -149,11 +149,6 @@ class RecurrentPlanner(LearnedPlanner):
 
     def _cells(self) -> list[ConvLSTMCell]:
         return [cell for cell in self.cells if isinstance(cell, ConvLSTMCell)]
-
-
-def _convolve(layer: nn.Conv2d, x: Tensor) -> Tensor:
-    """Return what a 3 x 3 layer returns, without the cost of a module's call, of which a decision has many."""
-    return torch.conv2d(x, layer.weight, layer.bias, padding=1)
 
 
 def _bias(layer: nn.Conv2d) -> nn.Parameter:
