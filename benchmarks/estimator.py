@@ -16,13 +16,13 @@ import torch
 import tyro
 
 from benchmarks.timing import milliseconds
+from mujoban_core.bodies import BALL
+from mujoban_core.interfaces import EstimatorInput, TerminationInput
 from mujoban_estimator.bag_stream import ReadReport, find_bags, open_checked, stretches
 from mujoban_estimator.data import Batch
 from mujoban_estimator.estimator import StateEstimator
 from mujoban_estimator.learner import Learner, LearnerConfig
 from mujoban_estimator.termination import ControlTermination
-from mujoban_sim.bodies import BALL
-from mujoban_sim.interfaces import EstimatorInput, TerminationInput
 
 
 @dataclass(frozen=True)

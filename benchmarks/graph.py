@@ -17,10 +17,10 @@ import tyro
 from bringup.command import Choice, Stack
 from bringup.rollout import rollout
 from bringup.stack import PlayOptions, play
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.plugins import ROLES
-from mujoban_sim.sense_plan_act import SensePlanAct
+from mujoban_core.plugins import ROLES
+from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 
 @dataclass

@@ -17,11 +17,11 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from mujoban_rl.stats import wilson_interval
-from mujoban_sim.generator import generate_batch, generate_levels
-from mujoban_sim.grid import DIFFICULTIES
-from mujoban_sim.levels import LevelBatch
-from mujoban_sim.solver import MAX_NODES, Status, demonstrations, label_states, solve_batch
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.stats import wilson_interval
+from mujoban_sokoban.generator import generate_batch, generate_levels
+from mujoban_sokoban.levels import LevelBatch
+from mujoban_sokoban.solver import MAX_NODES, Status, demonstrations, label_states, solve_batch
 
 PERCENTILES: Final = (5, 25, 50, 75, 95)
 

@@ -16,12 +16,12 @@ import tyro
 from tqdm import tqdm
 
 from bringup.rollout import ticks
-from mujoban_rl.stats import wilson_interval
-from mujoban_sim.episodes import Episodes
+from mujoban_core.sense_plan_act import SensePlanAct
+from mujoban_core.stats import wilson_interval
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
-from mujoban_sim.sense_plan_act import SensePlanAct
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from mujoban_planner.samples import SampleBuffer, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import Teacher
 from mujoban_rl.weights import save_weights
-from mujoban_sim.generator import generate_batch
+from mujoban_sokoban.generator import generate_batch
 
 
 @dataclass(frozen=True)

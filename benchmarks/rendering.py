@@ -18,10 +18,10 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import mujoco
 import numpy as np
 
-from mujoban_sim.camera import FRAME_SIZE
-from mujoban_sim.episodes import Episodes
+from mujoban_core.camera import FRAME_SIZE
 from mujoban_sim.scene import SceneCache
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 BATCH = 64
 THREADS = 2

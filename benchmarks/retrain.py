@@ -19,8 +19,8 @@ from typing import Any
 
 import tyro
 
-from mujoban_sim.generator import TEST_SEEDS
-from mujoban_sim.plugins import ROLES
+from mujoban_core.plugins import ROLES
+from mujoban_sokoban.generator import TEST_SEEDS
 
 PAIR = ("estimator", "termination")
 

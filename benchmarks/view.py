@@ -26,7 +26,7 @@ from bringup.live import free_port
 from bringup.monitor import MonitorNode
 from bringup.results import EpisodeResult
 from bringup.stack import PlayOptions, play, viewer
-from mujoban_sim.episodes import Episodes
+from mujoban_sokoban.episodes import Episodes
 
 WEB_PORT = 9090
 """Where the viewer looks for a free port."""

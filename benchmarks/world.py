@@ -20,10 +20,10 @@ import numpy as np
 import tyro
 
 import mujoban_sim  # noqa: F401 - registers the environment
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.grid import xy_to_cell
+from mujoban_core.grid import xy_to_cell
 from mujoban_sim.scene import SUBSTEPS, SceneCache
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 BATCH = 64
 THREADS = 2

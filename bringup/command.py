@@ -11,15 +11,15 @@ from typing import NoReturn
 
 import numpy as np
 
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.interfaces import Module
+from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
+from mujoban_core.plugins import LEARNED, ORACLE, ROLES, load_module, shipped_weights
+from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_rl.weights import WeightsError, digest
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.grid import DIFFICULTIES
-from mujoban_sim.interfaces import Module
-from mujoban_sim.look_around import LOOK_AROUND_TICKS, look_around
-from mujoban_sim.plugins import LEARNED, ORACLE, ROLES, load_module, shipped_weights
 from mujoban_sim.rendering import RenderingError
-from mujoban_sim.sense_plan_act import SensePlanAct
-from mujoban_sim.solver import Status, solve_levels
+from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.solver import Status, solve_levels
 
 USAGE_ERROR = 2
 """Exit status of a command whose input was bad."""

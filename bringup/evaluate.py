@@ -24,9 +24,9 @@ from bringup.command import (
 )
 from bringup.results import EpisodeResult, report, write_report
 from bringup.rollout import rollout
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.sense_plan_act import SensePlanAct
+from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 PROG = "evaluate.py"
 

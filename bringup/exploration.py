@@ -15,8 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.grid import AGENT, BOX, TARGET, WALL, Instruction
-from mujoban_sim.interfaces import (
+from mujoban_core.grid import AGENT, BOX, TARGET, WALL, Instruction
+from mujoban_core.interfaces import (
     Controller,
     ControllerInput,
     Memory,
@@ -26,8 +26,8 @@ from mujoban_sim.interfaces import (
     put_rows,
     take_rows,
 )
-from mujoban_sim.rules import apply
-from mujoban_sim.sense_plan_act import SensePlanAct
+from mujoban_core.sense_plan_act import SensePlanAct
+from mujoban_sokoban.rules import apply
 
 _FOREVER: Final = 1 << 30
 _WALK: Final = 25

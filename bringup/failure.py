@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bringup.results import EpisodeResult, Failure
-from mujoban_sim import rules
-from mujoban_sim.grid import AGENT, BOX, OFFSETS_RC, TARGET, WALL, Instruction
-from mujoban_sim.solver import Status, solve
+from mujoban_core.grid import AGENT, BOX, OFFSETS_RC, TARGET, WALL, Instruction
+from mujoban_sokoban import rules
+from mujoban_sokoban.solver import Status, solve
 
 PROOF_NODES = 50_000
 """Search nodes that a proof of unsolvability may take; beyond them a state counts as solvable."""

@@ -23,7 +23,7 @@ from bringup.parameters import Parameters, write_parameters
 from mujoban_controller.node import ControllerNode
 from mujoban_estimator.node import EstimatorNode
 from mujoban_estimator.termination_node import TerminationNode
-from mujoban_msgs_py.module_node import ModuleNode
+from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_planner.node import PlannerNode
 from mujoban_sim.node import SimulatorNode
 

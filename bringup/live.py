@@ -25,12 +25,12 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
 
 from bringup.overlay import grid_picture
+from mujoban_core.grid import CHANNELS
+from mujoban_core.grid import Instruction as Direction
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.raw import raw_stamp, read
-from mujoban_msgs_py.tick_node import live_qos, run_node
+from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK, Topic
-from mujoban_sim.grid import CHANNELS
-from mujoban_sim.grid import Instruction as Direction
 
 APPLICATION: Final = "mujoban"
 NICENESS: Final = 10

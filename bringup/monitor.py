@@ -16,8 +16,8 @@ from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
-from mujoban_msgs_py.tick_node import live_qos
 
 _WATCHED = (topics.INSTRUCTION, topics.TERMINATION, topics.ABSTRACT_STATE, topics.TRUE_ABSTRACT_STATE)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from mujoban_sim.grid import CHANNELS, CONTROL_PERIOD, OFFSETS_RC, Instruction
+from mujoban_core.grid import CHANNELS, CONTROL_PERIOD, OFFSETS_RC, Instruction
 
 CELL: Final = 10
 """Pixels along the edge of a cell of the small map."""

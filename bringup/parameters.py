@@ -8,9 +8,9 @@ from typing import Any
 import yaml
 
 from bringup.command import Stack
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.look_around import LOOKING_ROLES
-from mujoban_sim.plugins import ROLES
+from mujoban_core.look_around import LOOKING_ROLES
+from mujoban_core.plugins import ROLES
+from mujoban_sokoban.episodes import Episodes
 
 DEFAULTS = Path(__file__).parent / "config" / "stack.yaml"
 

@@ -20,13 +20,13 @@ from rich.progress import Progress
 from bringup.command import Parser, Stack, add_module_options, import_from_here, run_command, stack_from
 from bringup.exploration import Disturbance, disturbed
 from bringup.rollout import ticks
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_rl.training import StopSignal
-from mujoban_sim.episodes import LazyEpisodes, after_moves
-from mujoban_sim.generator import TRAIN_SEEDS, generate_level
-from mujoban_sim.grid import DIFFICULTIES
-from mujoban_sim.sense_plan_act import SensePlanAct
-from mujoban_sim.solver import solve_level
-from mujoban_sim.world import EpisodeSpec, World
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import EpisodeSpec, LazyEpisodes, after_moves
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.solver import solve_level
 
 PROG = "record.py"
 _START_STREAM = 2
@@ -101,7 +101,7 @@ def record(job: Job, progress: Progress | None = None) -> int:
     """Play and record the episodes of a job, unless a signal asks to stop; return the number of ticks."""
     import torch
 
-    from bringup.recording import Recorder
+    from bringup.rollout_recorder import Recorder
 
     torch.set_num_threads(1)
     policy: SensePlanAct = job.stack.policy()

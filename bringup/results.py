@@ -10,8 +10,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from mujoban_rl.stats import wilson_interval
-from mujoban_rl.weights import write_atomically
+from mujoban_core.files import write_atomically
+from mujoban_core.stats import wilson_interval
 
 
 class Failure(StrEnum):

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
-from mujoban_sim.interfaces import GroundTruth, Observation, renew_rows
-from mujoban_sim.sense_plan_act import Decision, SensePlanAct
-from mujoban_sim.world import EpisodeSpec, World
+from mujoban_core.interfaces import GroundTruth, Observation, renew_rows
+from mujoban_core.sense_plan_act import Decision, SensePlanAct
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import EpisodeSpec
 
 Tree = TypeVar("Tree")
 

@@ -19,14 +19,14 @@ from rclpy.parameter import Parameter
 from bringup.command import Stack
 from bringup.domain import claim_domain
 from bringup.graph import NODES, RESPAWN_PERIOD, GraphError, InProcess, Processes
+from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
-from bringup.recorder import RecorderNode
 from bringup.results import EpisodeResult
 from bringup.video import EDGE, VideoNode
-from mujoban_msgs_py.tick_node import init_ros, noted_signals, spin
-from mujoban_sim.camera import FRAME_SIZE
-from mujoban_sim.episodes import Episodes
+from mujoban_core.camera import FRAME_SIZE
+from mujoban_msgs_py.runtime.tick_node import init_ros, noted_signals, spin
+from mujoban_sokoban.episodes import Episodes
 
 DRAIN_TIMEOUT = 5.0
 """Seconds that recorder and video have for the last tick."""

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 
 from bringup.overlay import Said, draw
+from mujoban_core.grid import CONTROL_PERIOD
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
-from mujoban_msgs_py.tick_node import live_qos
-from mujoban_sim.grid import CONTROL_PERIOD
 
 EDGE: Final = 384
 """Pixels along the edges of each of the two pictures; a multiple of 16, as H.264 wants it."""

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from bringup.monitor import Watched
 from bringup.results import EpisodeResult
-from mujoban_sim.grid import AGENT, BOX, CONTROL_PERIOD, TARGET, WALL, Instruction
+from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, TARGET, WALL, Instruction
 
 ARROWS = {
     Instruction.STAY: "●",

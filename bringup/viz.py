@@ -19,9 +19,9 @@ from rclpy.node import Node
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from mujoban_core.grid import CELL_SIZE, CHANNELS, TARGET, WALL, cell_to_xy
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.tick_node import live_qos, run_node
-from mujoban_sim.grid import CELL_SIZE, CHANNELS, TARGET, WALL, cell_to_xy
+from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 
 PREFIX: Final = "/viz"
 PERIOD: Final = 2

@@ -23,14 +23,14 @@ from mujoban_controller.goal_features import drift, privileged_features
 from mujoban_controller.goal_task import GoalTaskConfig
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.replay import memory_fields
+from mujoban_core.bodies import Body, get_body
+from mujoban_core.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMIT, WALL, xy_to_cell
+from mujoban_core.interfaces import Memory
 from mujoban_estimator.bag_stream import find_bags
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError, open_bag
-from mujoban_sim.bodies import Body, get_body
-from mujoban_sim.generator import TEST_SEEDS
 from mujoban_sim.goals import GoalTracker
-from mujoban_sim.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMIT, WALL, xy_to_cell
-from mujoban_sim.interfaces import Memory
+from mujoban_sokoban.generator import TEST_SEEDS
 
 TOPICS: Final = (
     topics.EPISODE,

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_sim.bodies import INERTIAL_SIZE, get_body
-from mujoban_sim.camera import FRAME_SIZE, CameraMount, project
-from mujoban_sim.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction
-from mujoban_sim.interfaces import Controller, ControllerInput, Memory
+from mujoban_core.bodies import INERTIAL_SIZE, get_body
+from mujoban_core.camera import FRAME_SIZE, CameraMount, project
+from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction
+from mujoban_core.interfaces import Controller, ControllerInput, Memory
 
 MIN_SCALE = 1e-3
 """Smallest standard deviation of a torque."""
@@ -177,7 +177,7 @@ class VisuomotorController(nn.Module, Controller):
         """Build the network for a body.
 
         Args:
-            body: Key in `mujoban_sim.bodies.BODIES`; fixes P and U.
+            body: Key in `mujoban_core.bodies.BODIES`; fixes P and U.
             channels: Width of the stem and of each residual block.
             features: F, width of the fully connected layers.
             hidden: H, width of the LSTM.

@@ -23,9 +23,9 @@ from mujoban_controller.drivers import Driver, WanderingDriver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask, TaskStep
 from mujoban_controller.replay import SequenceReplay, memory_fields
+from mujoban_core.grid import Instruction
+from mujoban_core.interfaces import Memory, renew_rows
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.grid import Instruction
-from mujoban_sim.interfaces import Memory, renew_rows
 
 _KINDS = len(GoalKind) - 1
 

@@ -12,7 +12,7 @@ from mujoban_controller.goal_features import privileged_features
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
-from mujoban_sim.interfaces import Controller, Memory, renew_rows
+from mujoban_core.interfaces import Controller, Memory, renew_rows
 
 Driver = Callable[[GoalTask], NDArray[np.float32]]
 """Torques in [-1, 1] for the task's current tick, [B, U]."""

@@ -21,10 +21,11 @@ from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.drivers import Driver, PrivilegedDriver, scripted_driver
 from mujoban_controller.judge import judge
 from mujoban_controller.privileged import PrivilegedPolicy
-from mujoban_rl.weights import digest, load_weights, write_atomically
-from mujoban_sim.generator import TEST_SEEDS
-from mujoban_sim.interfaces import Controller
+from mujoban_core.files import write_atomically
+from mujoban_core.interfaces import Controller
+from mujoban_rl.weights import digest, load_weights
 from mujoban_sim.oracles import OraclePlanner
+from mujoban_sokoban.generator import TEST_SEEDS
 
 
 @dataclass(frozen=True)

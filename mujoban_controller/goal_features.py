@@ -13,9 +13,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.bodies import Body
+from mujoban_core.bodies import Body
+from mujoban_core.grid import GRID_SIZE, OFFSETS_XY, cell_to_xy, xy_to_cell
 from mujoban_sim.goals import GoalKind, GoalTracker
-from mujoban_sim.grid import GRID_SIZE, OFFSETS_XY, cell_to_xy, xy_to_cell
 
 _NEIGHBOURS = np.array([[x, y] for x in (-1, 0, 1, 2) for y in (-1, 0, 1) if (x, y) != (0, 0)], np.float64)
 """Cells around the origin cell whose contents matter, (along, left), [11, 2]."""

@@ -29,11 +29,12 @@ from mujoban_controller.instructions import (
     feasible_kinds,
     random_instruction,
 )
+from mujoban_core.grid import COMPLETION_TOLERANCE, DIFFICULTIES, INSTRUCTION_LIMIT, Instruction
+from mujoban_core.interfaces import ControllerInput, Planner, put_rows, take_rows
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.grid import COMPLETION_TOLERANCE, DIFFICULTIES, INSTRUCTION_LIMIT, Instruction
-from mujoban_sim.interfaces import ControllerInput, Planner, put_rows, take_rows
-from mujoban_sim.levels import LevelError
-from mujoban_sim.world import EpisodeSpec, World
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.levels import LevelError
 
 EpisodeSource = Callable[[], EpisodeSpec]
 """Yields the next episode to play."""

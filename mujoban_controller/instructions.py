@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_core.grid import INSTRUCTION_LIMIT, Instruction
 from mujoban_sim.goals import GoalKind, GoalTracker
-from mujoban_sim.grid import INSTRUCTION_LIMIT, Instruction
 from mujoban_sim.world import World
 
 _HEADINGS = [i for i in Instruction if i != Instruction.STAY]

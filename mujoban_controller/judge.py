@@ -15,12 +15,12 @@ import numpy as np
 
 from mujoban_controller.drivers import ControllerDriver, Driver
 from mujoban_controller.goal_task import EpisodeEnd, GoalTask, Outcome, judging_config
-from mujoban_rl.stats import wilson_interval
-from mujoban_sim.generator import generate_level
+from mujoban_core.grid import Instruction
+from mujoban_core.interfaces import Controller, Planner
+from mujoban_core.stats import wilson_interval
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.grid import Instruction
-from mujoban_sim.interfaces import Controller, Planner
-from mujoban_sim.world import EpisodeSpec
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.generator import generate_level
 
 
 def kind_name(outcome: Outcome) -> str:

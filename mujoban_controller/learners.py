@@ -22,7 +22,7 @@ from mujoban_controller.goal_task import GoalTask, TaskStep
 from mujoban_controller.mpo import MPOCollector, MPOLearner, MPOTrainingConfig, Policy
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.replay import SequenceReplay
-from mujoban_sim.interfaces import Controller
+from mujoban_core.interfaces import Controller
 
 ConfigT = TypeVar("ConfigT", DistilConfig, MPOTrainingConfig)
 

@@ -24,8 +24,8 @@ from mujoban_controller.goal_features import privileged_features
 from mujoban_controller.goal_task import GoalTask, TaskStep
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
 from mujoban_controller.replay import SequenceReplay, memory_fields
+from mujoban_core.interfaces import Memory, renew_rows
 from mujoban_rl.mpo_continuous import MPOConfig, MPOLoss, td_target
-from mujoban_sim.interfaces import Memory, renew_rows
 
 Policy = PrivilegedPolicy | VisuomotorController
 

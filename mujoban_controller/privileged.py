@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from mujoban_controller.controller import Gaussian, gaussian, gaussian_layers
 from mujoban_controller.goal_features import feature_size
-from mujoban_sim.bodies import get_body
+from mujoban_core.bodies import get_body
 
 
 class PrivilegedPolicy(nn.Module):

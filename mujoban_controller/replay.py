@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_sim.interfaces import Memory
+from mujoban_core.interfaces import Memory
 
 
 def memory_fields(memory: Memory) -> dict[str, NDArray]:

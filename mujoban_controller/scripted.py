@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from mujoban_controller.goal_features import goal_offsets
 from mujoban_controller.goal_task import GoalTask
+from mujoban_core.grid import OFFSETS_XY
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.grid import OFFSETS_XY
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,10 @@ from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
 from mujoban_rl.weights import digest, load_weights, provenance, save_weights
-from mujoban_sim.episodes import after_moves
-from mujoban_sim.generator import TRAIN_SEEDS, generate_level
 from mujoban_sim.oracles import OraclePlanner
-from mujoban_sim.solver import solve_level
-from mujoban_sim.world import EpisodeSpec
+from mujoban_sokoban.episodes import EpisodeSpec, after_moves
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.solver import solve_level
 
 PLANNER_NODES = 20_000
 """Search nodes for the plans that the goal task follows; levels that need more are played at random."""

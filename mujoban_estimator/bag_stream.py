@@ -10,13 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from mujoban_core.interfaces import NO_INSTRUCTION
 from mujoban_estimator.data import Stretch
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError, open_bag
 from mujoban_msgs_py.bags.metadata import FILE_NAME
 from mujoban_msgs_py.conversions import EpisodeReading
-from mujoban_sim.generator import TEST_SEEDS
-from mujoban_sim.interfaces import NO_INSTRUCTION
+from mujoban_sokoban.generator import TEST_SEEDS
 
 TOPICS: Final = (
     topics.EPISODE,

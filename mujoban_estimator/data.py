@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.bodies import Body
-from mujoban_sim.grid import GRID_SIZE, WALL
-from mujoban_sim.visibility import cells_in_view
+from mujoban_core.bodies import Body
+from mujoban_core.grid import GRID_SIZE, WALL
+from mujoban_core.visibility import cells_in_view
 
 
 class Stretch(NamedTuple):

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mujoban_sim.camera import FRAME_SIZE
+from mujoban_core.camera import FRAME_SIZE
 
 STRIDE: Final = 4
 """Pixels of a frame per row or column of the feature map."""

@@ -14,11 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from mujoban_core.bodies import get_body
+from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
+from mujoban_core.interfaces import Estimator, EstimatorInput, Memory
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.geometry import ANCHORS, CELLS, FEATURES, cell_geometry
-from mujoban_sim.bodies import get_body
-from mujoban_sim.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
-from mujoban_sim.interfaces import Estimator, EstimatorInput, Memory
 
 BINARY: Final = (WALL, TARGET, BOX)
 """Layers with an independent classifier per cell; the agent's is one softmax over all cells."""

@@ -10,8 +10,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.camera import FRAME_SIZE, CameraMount, project
-from mujoban_sim.grid import GRID_SIZE, cell_to_xy
+from mujoban_core.camera import FRAME_SIZE, CameraMount, project
+from mujoban_core.grid import GRID_SIZE, cell_to_xy
 
 CELLS: Final = GRID_SIZE * GRID_SIZE
 ANCHORS: Final[tuple[tuple[float, float], ...]] = ((0.0, 0.0), (0.0, 0.3), (0.5, 0.25))

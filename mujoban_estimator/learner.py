@@ -14,13 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_core.grid import OFFSETS_XY
+from mujoban_core.interfaces import renew_rows
 from mujoban_estimator.data import Batch
 from mujoban_estimator.estimator import Belief, EstimatorConfig, StateEstimator
 from mujoban_estimator.losses import Views, estimator_loss, termination_loss
 from mujoban_estimator.odometry import Track
 from mujoban_estimator.termination import ControlTermination, TerminationConfig, true_phases
-from mujoban_sim.grid import OFFSETS_XY
-from mujoban_sim.interfaces import renew_rows
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
+from mujoban_core.grid import AGENT, CHANNELS
 from mujoban_estimator.estimator import BINARY, Estimates
-from mujoban_sim.grid import AGENT, CHANNELS
 
 
 class Views(NamedTuple):

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE
 from mujoban_estimator.estimator import BINARY
-from mujoban_sim.grid import AGENT, BOX, CHANNELS, GRID_SIZE
 
 _BINS: Final = 10
 SLACK: Final = 3

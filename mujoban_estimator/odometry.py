@@ -16,8 +16,8 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor
 
-from mujoban_sim.bodies import Body
-from mujoban_sim.grid import CONTROL_PERIOD, INSTRUCTION_LIMIT, OFFSETS_XY
+from mujoban_core.bodies import Body
+from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_LIMIT, OFFSETS_XY
 
 FEATURES: Final = 24
 """Features of a tick beside raw proprioception; see `Odometry.forward`."""

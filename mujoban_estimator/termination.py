@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from mujoban_core.bodies import get_body
+from mujoban_core.grid import INSTRUCTION_LIMIT
+from mujoban_core.interfaces import Memory, Termination, TerminationInput
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.odometry import FEATURES, Odometry, Track, turn
-from mujoban_sim.bodies import get_body
-from mujoban_sim.grid import INSTRUCTION_LIMIT
-from mujoban_sim.interfaces import Memory, Termination, TerminationInput
 
 PHASES: Final = 4
 """Cosine and sine of the robot's place within its cell, along and across the instruction."""

@@ -14,11 +14,11 @@ from mujoban_msgs.msg import Episode, Instruction
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
+from mujoban_core.interfaces import NO_INSTRUCTION, GroundTruth, TerminationInput
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.module_node import ModuleNode
 from mujoban_msgs_py.raw import raw_stamp, read
-from mujoban_msgs_py.tick_node import Input, Output, run_node
-from mujoban_sim.interfaces import NO_INSTRUCTION, GroundTruth, TerminationInput
+from mujoban_msgs_py.runtime.module_node import ModuleNode
+from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 
 _SETTINGS = ("sample", "threshold", "limit")
 

@@ -19,13 +19,13 @@ import torch
 import tyro
 from torch.utils.data import DataLoader, IterableDataset
 
+from mujoban_core.bodies import get_body
 from mujoban_estimator.bag_stream import ReadReport, endless, find_bags, open_checked
 from mujoban_estimator.data import Batch, Batcher
 from mujoban_estimator.evaluate import evaluate
 from mujoban_estimator.learner import Learner, LearnerConfig
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
 from mujoban_rl.weights import load_weights, provenance, save_weights
-from mujoban_sim.bodies import get_body
 
 
 @dataclass(frozen=True)

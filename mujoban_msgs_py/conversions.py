@@ -24,9 +24,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import Header
 
-from mujoban_sim.camera import FRAME_SIZE
-from mujoban_sim.grid import CHANNELS, GRID_SIZE
-from mujoban_sim.grid import Instruction as Direction
+from mujoban_core.camera import FRAME_SIZE
+from mujoban_core.grid import CHANNELS, GRID_SIZE
+from mujoban_core.grid import Instruction as Direction
 
 ENCODING: Final = "rgb8"
 _SECOND: Final = 1_000_000_000
@@ -118,7 +118,7 @@ def camera_info_from_msg(message: Any) -> NDArray[np.float64]:
 
 
 def proprio_to_msg(header: Header, proprio: ArrayLike, joints: Sequence[str]) -> Proprioception:
-    """Return o_pr, [P], in the layout of `mujoban_sim.bodies.Body`, of a body with these joints."""
+    """Return o_pr, [P], in the layout of `mujoban_core.bodies.Body`, of a body with these joints."""
     count = len(joints)
     values = _finite("proprio", proprio, (12 + 2 * count,), np.float64).tolist()
     linear, angular, acceleration = (_vector(values[i : i + 3]) for i in (0, 3, 6))
@@ -135,7 +135,7 @@ def proprio_to_msg(header: Header, proprio: ArrayLike, joints: Sequence[str]) ->
 
 
 def proprio_from_msg(message: Any) -> NDArray[np.float32]:
-    """Return o_pr, [P], in the layout of `mujoban_sim.bodies.Body`."""
+    """Return o_pr, [P], in the layout of `mujoban_core.bodies.Body`."""
     count = len(message.name)
     if not len(message.position) == len(message.velocity) == count:
         raise ConversionError(

@@ -16,7 +16,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import Header
 
-from mujoban_sim.grid import CONTROL_PERIOD
+from mujoban_core.grid import CONTROL_PERIOD
 
 if TYPE_CHECKING:
     from rclpy.qos import QoSProfile

@@ -1,6 +1,6 @@
 """Thousands of Sokoban levels at once in torch, on CPU or GPU: the time-abstracted task of paper C.2.
 
-The rules and rewards are those of `mujoban_sim.rules`, which the tests hold it to. An instruction may fail, as with
+The rules and rewards are those of `mujoban_sokoban.rules`, which the tests hold it to. An instruction may fail, as with
 a real controller: the state then stays as it is and the abstract episode ends early.
 
 Shapes: B levels, N = `grid.GRID_SIZE`.
@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mujoban_core.grid import GRID_SIZE, OFFSETS_RC, Instruction
 from mujoban_planner.teacher import STEP_REWARD
-from mujoban_sim.grid import GRID_SIZE, OFFSETS_RC, Instruction
-from mujoban_sim.levels import Level
-from mujoban_sim.rules import BOX_REWARD, SOLVED_REWARD
+from mujoban_sokoban.levels import Level
+from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD
 
 MOVE_LIMIT: Final = 120
 """Instructions of an abstract episode."""

@@ -1,6 +1,6 @@
 """States in the forms that the planner's parts want: level batches, 64-bit boards, abstract states.
 
-The interior of a level has 8 x 8 cells, so each layer of a state is one 64-bit board as in `mujoban_sim.bitboard`.
+The interior of a level has 8 x 8 cells, so each layer of a state is one 64-bit board as in `mujoban_sokoban.bitboard`.
 
 Shapes: B levels, M boards, K boxes, N = `grid.GRID_SIZE`.
 """
@@ -15,10 +15,10 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
 from mujoban_planner.symmetry import cell_sources
-from mujoban_sim.bitboard import SIDE, SQUARES
-from mujoban_sim.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
-from mujoban_sim.levels import LevelBatch
+from mujoban_sokoban.bitboard import SIDE, SQUARES
+from mujoban_sokoban.levels import LevelBatch
 
 
 class BitBoards(NamedTuple):

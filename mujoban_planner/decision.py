@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, OFFSETS_RC, Instruction
 from mujoban_planner.heads import INSTRUCTIONS, INTERIOR
 from mujoban_planner.symmetry import SYMMETRIES
-from mujoban_sim.grid import AGENT, BOX, CHANNELS, GRID_SIZE, OFFSETS_RC, Instruction
 
 HISTORY = 256
 """Decisions remembered; an episode has at most 240 s, some 120 moves."""

@@ -13,18 +13,18 @@ import numpy as np
 import torch
 import tyro
 
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.stats import wilson_interval
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import take_levels
 from mujoban_planner.lookahead import LookAheadPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
-from mujoban_rl.stats import wilson_interval
 from mujoban_rl.weights import digest
-from mujoban_sim.generator import TEST_SEEDS, generate_batch
-from mujoban_sim.grid import DIFFICULTIES
-from mujoban_sim.levels import LevelBatch, read_levels, stack_levels
-from mujoban_sim.solver import Status, solve_batch
+from mujoban_sokoban.generator import TEST_SEEDS, generate_batch
+from mujoban_sokoban.levels import LevelBatch, read_levels, stack_levels
+from mujoban_sokoban.solver import Status, solve_batch
 
 _CHUNK = 1024
 """Levels played at once."""

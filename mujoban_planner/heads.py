@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_core.grid import AGENT, GRID_SIZE, Instruction
 from mujoban_planner.propagation import legal_pushes, walk_to_push
-from mujoban_sim.grid import AGENT, GRID_SIZE, Instruction
 
 INSTRUCTIONS: Final = len(Instruction)
 INTERIOR: Final = GRID_SIZE - 2

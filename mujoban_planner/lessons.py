@@ -26,9 +26,9 @@ from mujoban_planner.play import Game, play
 from mujoban_planner.samples import Samples, concatenate, make_batch
 from mujoban_planner.teacher import Teacher, label_deadly, possible_pushes
 from mujoban_rl.weights import WeightsError
-from mujoban_sim.generator import TRAIN_SEEDS, generate_batch
-from mujoban_sim.levels import LevelBatch
-from mujoban_sim.solver import Status
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
+from mujoban_sokoban.levels import LevelBatch
+from mujoban_sokoban.solver import Status
 
 _WALK_SHARE: Final = 0.35
 """Share of walking states that is kept; pushes decide a level."""

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mujoban_core.interfaces import Memory, Planner, put_rows, take_rows
 from mujoban_planner.abstract_env import MOVE_LIMIT, AbstractEnvironment
 from mujoban_planner.boards import likeliest_boards, state_tensor
 from mujoban_planner.decision import PushThoughts, VisitCounts, count_visits, recall, remember, state_keys
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state, split_memory
 from mujoban_planner.search import search
-from mujoban_sim.interfaces import Memory, Planner, put_rows, take_rows
 
 _RETRY: Final = 6
 """Decisions by the policy alone after a search that found nothing."""

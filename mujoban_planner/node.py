@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from mujoban_msgs.msg import Episode
 
+from mujoban_core.interfaces import GroundTruth
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.module_node import ModuleNode
-from mujoban_msgs_py.tick_node import Input, Output, run_node
-from mujoban_sim.interfaces import GroundTruth
+from mujoban_msgs_py.runtime.module_node import ModuleNode
+from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 
 
 class PlannerNode(ModuleNode):

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_core.grid import CHANNELS, GRID_SIZE
+from mujoban_core.interfaces import Memory, Planner
 from mujoban_planner.compiled import CompiledDecision
 from mujoban_planner.decision import (
     PushThoughts,
@@ -34,8 +36,6 @@ from mujoban_planner.decision import (
 )
 from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, Weighed, log_alive, verdicts
 from mujoban_planner.propagation import PLANES, propagate
-from mujoban_sim.grid import CHANNELS, GRID_SIZE
-from mujoban_sim.interfaces import Memory, Planner
 
 CAUTION = 4.0
 """Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/planner.md)."""

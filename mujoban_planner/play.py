@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mujoban_core.interfaces import Planner, put_rows, take_rows
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import abstract_states, take_levels
-from mujoban_sim import rules
-from mujoban_sim.interfaces import Planner, put_rows, take_rows
-from mujoban_sim.levels import LevelBatch
+from mujoban_sokoban import rules
+from mujoban_sokoban.levels import LevelBatch
 
 
 class Game(NamedTuple):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mujoban_sim.grid import AGENT, BOX, OFFSETS_RC, TARGET
+from mujoban_core.grid import AGENT, BOX, OFFSETS_RC, TARGET
 
 PLANES: Final = 3
 """Reachable, nearness to the robot, nearness of a lone box to a target."""

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_core.grid import CHANNELS, GRID_SIZE, Instruction
 from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.boards import abstract_states
@@ -31,8 +32,7 @@ from mujoban_rl.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_val
 from mujoban_rl.replay import TimeMajorReplay, windowed_returns
 from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
 from mujoban_rl.weights import digest, provenance, save_weights
-from mujoban_sim.generator import TRAIN_SEEDS, generate_batch
-from mujoban_sim.grid import CHANNELS, GRID_SIZE, Instruction
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 
 _STATE = (GRID_SIZE, GRID_SIZE, len(CHANNELS))
 

@@ -15,10 +15,10 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_core.grid import Instruction
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.symmetry import SYMMETRIES, cell_sources, instruction_map
-from mujoban_sim.bitboard import SIDE, SQUARES
-from mujoban_sim.grid import Instruction
+from mujoban_sokoban.bitboard import SIDE, SQUARES
 
 EVERY_INSTRUCTION = (1 << len(Instruction)) - 1
 """The mask of all instructions."""

@@ -4,7 +4,7 @@ A node is a state after a push; an edge is a legal push with the network's proba
 of log(depth + 1) - sum of log-probabilities - weight * log p(alive): the policy says where to look, the dead-state head
 what to leave. One network evaluation expands one node of every level that is still open.
 
-Boards are those of `mujoban_sim.bitboard`. Shapes: M levels, I = 8, K pushes, T moves.
+Boards are those of `mujoban_sokoban.bitboard`. Shapes: M levels, I = 8, K pushes, T moves.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from numba import njit
 from numpy.typing import NDArray
 from torch.nn import functional
 
+from mujoban_core.grid import Instruction
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.heads import verdicts
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_sim.bitboard import NONE, ONE, SQUARE_STEP, SQUARES, Bits, bit, flood, lowest, shift
-from mujoban_sim.grid import Instruction
-from mujoban_sim.solver_labels import moves_of, walk_distances
+from mujoban_sokoban.bitboard import NONE, ONE, SQUARE_STEP, SQUARES, Bits, bit, flood, lowest, shift
+from mujoban_sokoban.solver_labels import moves_of, walk_distances
 
 DEAD_WEIGHT: Final = 1.0
 """Weight of log p(alive) in a node's cost."""

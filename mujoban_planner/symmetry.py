@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_sim.grid import OFFSETS_RC
+from mujoban_core.grid import OFFSETS_RC
 
 SYMMETRIES = 8
 

@@ -15,13 +15,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from mujoban_core.grid import GRID_SIZE, OFFSETS_RC, Instruction
 from mujoban_planner.boards import BitBoards, bit_boards, take_levels
 from mujoban_planner.samples import EVERY_INSTRUCTION, Samples, concatenate, unlabelled
-from mujoban_sim.bitboard import SIDE, SQUARE_STEP, SQUARES, bit, flood, shift
-from mujoban_sim.grid import GRID_SIZE, OFFSETS_RC, Instruction
-from mujoban_sim.levels import LevelBatch
-from mujoban_sim.rules import BOX_REWARD, SOLVED_REWARD
-from mujoban_sim.solver import ABSENT, Demonstrations, Status, demonstrations, solve_batch
+from mujoban_sokoban.bitboard import SIDE, SQUARE_STEP, SQUARES, bit, flood, shift
+from mujoban_sokoban.levels import LevelBatch
+from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD
+from mujoban_sokoban.solver import ABSENT, Demonstrations, Status, demonstrations, solve_batch
 
 DISCOUNT: Final = 0.99
 """Discount of the planner's returns, per instruction."""

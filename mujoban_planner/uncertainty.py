@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_sim.bodies import BALL
-from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
-from mujoban_sim.visibility import cells_in_view
+from mujoban_core.bodies import BALL
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
+from mujoban_core.visibility import cells_in_view
 
 _VIEWS = 6
 """Most views that a hidden state is put together from."""

@@ -8,8 +8,8 @@ from typing import Final, Literal
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
-from mujoban_sim.generator import TEST_SEEDS, generate_batch
-from mujoban_sim.levels import LevelBatch
+from mujoban_sokoban.generator import TEST_SEEDS, generate_batch
+from mujoban_sokoban.levels import LevelBatch
 
 _FIRST_SEED: Final = 9_000_000
 _EPISODES: Final = {5: 256, 4: 64, 1: 64}

@@ -37,7 +37,8 @@ from torch import Tensor, nn
 from torch.utils.tensorboard.writer import SummaryWriter
 from tqdm import tqdm
 
-from mujoban_rl.weights import WeightsError, check_finite, write_atomically
+from mujoban_core.files import write_atomically
+from mujoban_rl.weights import WeightsError, check_finite
 
 
 class RunError(ValueError):

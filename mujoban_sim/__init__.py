@@ -1,4 +1,4 @@
-"""The simulated world: levels, rules, solver, physics, rendering, Gymnasium environments, simulator node."""
+"""The physical world: scene, physics, rendering, oracles, Gymnasium environments, simulator node."""
 
 from gymnasium.envs.registration import register
 

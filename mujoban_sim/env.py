@@ -12,12 +12,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mujoban_sim.bodies import Body
-from mujoban_sim.camera import FRAME_SIZE
-from mujoban_sim.generator import TRAIN_SEEDS, generate_level
-from mujoban_sim.grid import CHANNELS, CONTROL_PERIOD, DIFFICULTIES, GRID_SIZE
-from mujoban_sim.levels import Level, read_levels
-from mujoban_sim.world import EpisodeSpec, World
+from mujoban_core.bodies import Body
+from mujoban_core.camera import FRAME_SIZE
+from mujoban_core.grid import CHANNELS, CONTROL_PERIOD, DIFFICULTIES, GRID_SIZE
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.levels import Level, read_levels
 
 Observations = dict[str, Any]
 """Arrays by name."""
@@ -150,7 +151,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     | key | space | meaning | sets |
     |---|---|---|---|
     | ``frame`` | uint8 (64, 64, 3) | first-person camera, RGB | default, privileged |
-    | ``proprio`` | float32 (P,) | proprioception, see `mujoban_sim.bodies.Body`; P = 16 | all |
+    | ``proprio`` | float32 (P,) | proprioception, see `mujoban_core.bodies.Body`; P = 16 | all |
     | ``pose`` | float32 (3,) | x, y, yaw of the robot | all |
     | ``velocity`` | float32 (3,) | vx, vy, yaw rate in the frame ``map`` | state, privileged |
     | ``box_position`` | float32 (K, 2) | box centres; absent boxes lie 100 m away | state, privileged |
@@ -165,7 +166,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     Robot and boxes stand at the centres of their cells; the robot's heading is uniform. ``reset(seed=s)`` plays
     episode s: the level generated from s (or number s modulo the count of a level file), with the heading and the
     appearance of s. ``reset()`` draws a seed, never one of the test levels below 10,000,000.
-    ``reset(options={"level": level})`` plays a given `mujoban_sim.levels.Level`, or a level text.
+    ``reset(options={"level": level})`` plays a given `mujoban_sokoban.levels.Level`, or a level text.
 
     ## Episode end
     - ``terminated``: every box is on a target at once.

@@ -25,8 +25,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_sim.grid import CELL_SIZE, COMPLETION_TOLERANCE, Instruction, cell_to_xy
-from mujoban_sim.rules import apply
+from mujoban_core.grid import CELL_SIZE, COMPLETION_TOLERANCE, Instruction, cell_to_xy
+from mujoban_sokoban.rules import apply
 
 MAX_BOX_SPEED: Final = 0.3
 """Speed in m/s (of a world with 1 m cells; scaled with the cell) below which a pushed box counts as placed."""

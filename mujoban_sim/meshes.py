@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.grid import GRID_SIZE, cell_to_xy
+from mujoban_core.grid import GRID_SIZE, cell_to_xy
 from mujoban_sim.scene import PEG_HALF_DIAGONAL, PEG_HEIGHT, peg_corners
 
 DRAWN_WALL_HEIGHT: Final = 0.5

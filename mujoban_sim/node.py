@@ -20,15 +20,15 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
+from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.observation import ObservationPublisher, TickLabel
 from mujoban_msgs_py.raw import raw_stamp, read
-from mujoban_msgs_py.tick_node import LOG_PERIOD, live_qos, run_node
+from mujoban_msgs_py.runtime.tick_node import LOG_PERIOD, live_qos, run_node
 from mujoban_msgs_py.topics import TICK
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.grid import CONTROL_PERIOD, DIFFICULTIES
+from mujoban_sim.observation import ObservationPublisher, TickLabel
 from mujoban_sim.rendering import RenderingError
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 MATCH_PERIOD = 0.02
 """Seconds between two looks at whether the graph is complete."""
@@ -67,7 +67,7 @@ class SimulatorNode(Node):
     is deterministic. In real time it steps when the clock says so, and holds the latest torque.
 
     Parameters:
-        seed, episodes, difficulty, level_file: Which episodes are played, see `mujoban_sim.episodes.Episodes`;
+        seed, episodes, difficulty, level_file: Which episodes are played, see `mujoban_sokoban.episodes.Episodes`;
             `episodes` 0 means as many as a level file has, else one.
         time_limit: Steps of an episode; 0 means that of the body.
         body: The robot's body.

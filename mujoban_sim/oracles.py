@@ -11,10 +11,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.bodies import BALL
-from mujoban_sim.goals import GoalKind, GoalTracker
-from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, OFFSETS_XY, TARGET, WALL, Instruction, xy_to_cell
-from mujoban_sim.interfaces import (
+from mujoban_core.bodies import BALL
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_XY, TARGET, WALL, Instruction, xy_to_cell
+from mujoban_core.interfaces import (
     Controller,
     ControllerInput,
     Estimator,
@@ -25,8 +24,9 @@ from mujoban_sim.interfaces import (
     Termination,
     TerminationInput,
 )
-from mujoban_sim.rules import apply
-from mujoban_sim.solver import MAX_NODES, Status, solve
+from mujoban_sim.goals import GoalKind, GoalTracker
+from mujoban_sokoban.rules import apply
+from mujoban_sokoban.solver import MAX_NODES, Status, solve
 
 _MAX_PLAN: Final = 1024
 """Moves of a plan that are remembered; the rest of a longer one is found again when they are done."""

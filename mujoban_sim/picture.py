@@ -15,13 +15,14 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image
 
-from mujoban_sim.camera import FRAME_SIZE
-from mujoban_sim.generator import generate_level
-from mujoban_sim.interfaces import Observation
+from mujoban_core.camera import FRAME_SIZE
+from mujoban_core.interfaces import Observation
+from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.rendering import RenderingError
-from mujoban_sim.sense_plan_act import SensePlanAct
-from mujoban_sim.world import EpisodeSpec, World
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.generator import generate_level
 
 _SIZE = 480
 """Rows of the picture in pixels; frames are drawn twice as large and scaled down."""

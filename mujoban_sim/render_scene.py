@@ -14,10 +14,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_core.bodies import ROBOT_BODY, ROBOT_DEFAULTS, Body
+from mujoban_core.camera import in_view
+from mujoban_core.grid import GRID_SIZE
 from mujoban_sim.appearance import ATLAS_SHAPE, SKYLINE_SHAPE, band_range, draw_atlas, draw_skyline
-from mujoban_sim.bodies import ROBOT_BODY, ROBOT_DEFAULTS, Body
-from mujoban_sim.camera import in_view
-from mujoban_sim.grid import GRID_SIZE
 from mujoban_sim.meshes import DRAWN_WALL_HEIGHT, MAX_QUADS, Mesh, level_mesh, skyline_mesh
 from mujoban_sim.scene import BOX_HALF_EXTENT, box_vertices
 

@@ -17,19 +17,19 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mujoban_core.bodies import FIRST_PERSON_CAMERA, Body
+from mujoban_core.camera import FRAME_SIZE, in_view
+from mujoban_core.grid import GRID_SIZE, cell_to_xy
 from mujoban_sim.appearance import (
     BOX_COLOUR,
     BOX_ON_TARGET_COLOUR,
     PRESSED_TARGET_COLOUR,
     TARGET_COLOUR,
 )
-from mujoban_sim.bodies import FIRST_PERSON_CAMERA, Body
-from mujoban_sim.camera import FRAME_SIZE, in_view
-from mujoban_sim.grid import GRID_SIZE, cell_to_xy
-from mujoban_sim.levels import Level
 from mujoban_sim.render_scene import TOP_DOWN_CAMERA, UNSEEN_GROUP, RenderScene, build_scene, write_level
 from mujoban_sim.scene import BOX_HALF_EXTENT
 from mujoban_sim.worker import Worker
+from mujoban_sokoban.levels import Level
 
 CameraName = Literal["first_person", "top_down"]
 CAMERAS: Final[tuple[CameraName, ...]] = (FIRST_PERSON_CAMERA, TOP_DOWN_CAMERA)

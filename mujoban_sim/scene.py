@@ -5,7 +5,7 @@ batch can run each simulation on its own level: walls are merged into rectangles
 are left out, and both are filled up with geoms buried under the floor. Boxes that a level lacks are parked.
 
 Coordinates: qpos holds, for each of K boxes, its slide joints x, y, z (x and y in the frame ``map``, z the
-height of the underside), then the robot's positions (`mujoban_sim.bodies`). qvel follows the same order.
+height of the underside), then the robot's positions (`mujoban_core.bodies`). qvel follows the same order.
 
 Each box rests on one small sphere as its only contact with the floor. Boxes never turn, so nothing more is
 needed, and the contact problem is a quarter of the size.
@@ -20,8 +20,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.bodies import ROBOT_DEFAULTS, Body
-from mujoban_sim.grid import CONTROL_PERIOD, GRID_SIZE, cell_to_xy
+from mujoban_core.bodies import ROBOT_DEFAULTS, Body
+from mujoban_core.grid import CONTROL_PERIOD, GRID_SIZE, cell_to_xy
 
 PHYSICS_STEP: Final = 0.01
 """Seconds of one physics step."""

@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from mujoban_core.grid import DIFFICULTIES
 from mujoban_sim.env import (
     RENDER_SIZE,
     LevelSource,
@@ -24,7 +25,6 @@ from mujoban_sim.env import (
     observation_space,
     observe,
 )
-from mujoban_sim.grid import DIFFICULTIES
 from mujoban_sim.world import World
 
 

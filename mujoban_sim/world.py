@@ -7,7 +7,6 @@ All positions are metres in the frame ``map``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
@@ -15,16 +14,16 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
-from mujoban_sim.bodies import FIRST_PERSON_CAMERA, get_body
-from mujoban_sim.camera import FRAME_SIZE
+from mujoban_core.bodies import FIRST_PERSON_CAMERA, get_body
+from mujoban_core.camera import FRAME_SIZE
+from mujoban_core.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET, WALL, cell_to_xy, xy_to_cell
+from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
-from mujoban_sim.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET, WALL, cell_to_xy, xy_to_cell
-from mujoban_sim.interfaces import GroundTruth, Observation
 from mujoban_sim.scene import BOX_COORDINATES, SUBSTEPS, SceneCache, settled_positions
 from mujoban_sim.world_kernels import apply_torque, update
+from mujoban_sokoban.episodes import EpisodeSpec
 
 if TYPE_CHECKING:
-    from mujoban_sim.levels import Level
     from mujoban_sim.rendering import CameraName, FrameRenderer
 
 _STAGE_NONE: Final = int(mujoco.mjtStage.mjSTAGE_NONE)
@@ -35,14 +34,6 @@ _HEADING_STREAM: Final = 1
 
 class TorqueError(ValueError):
     """A torque has the wrong shape, is not finite or lies outside [-1, 1]; the world has not moved."""
-
-
-@dataclass(frozen=True)
-class EpisodeSpec:
-    """What fixes an episode: the level, and the seed of initial heading and appearance."""
-
-    level: Level
-    seed: int
 
 
 def initial_heading(seed: int) -> float:
@@ -64,7 +55,7 @@ class World:
         body: the robot's `Body`.
         pose: (x [m], y [m], psi [rad], in [-pi, pi]) of the robot, float32 [B, 3].
         velocity: (vx [m/s], vy [m/s], yaw rate [rad/s]) in the map frame, float32 [B, 3].
-        proprio: o_pr, layout in `mujoban_sim.bodies.Body`, float32 [B, P].
+        proprio: o_pr, layout in `mujoban_core.bodies.Body`, float32 [B, P].
         box_position: o_box, float32 [B, K, 2]; boxes that a level lacks lie far outside the grid.
         box_speed: [m/s], float32 [B, K].
         box_count: boxes of each level, int64 [B].
@@ -98,7 +89,7 @@ class World:
 
         Args:
             batch: B.
-            body: name of the robot's body, a key of `mujoban_sim.bodies.BODIES`.
+            body: name of the robot's body, a key of `mujoban_core.bodies.BODIES`.
             max_boxes: K, the most boxes of any level to be played.
             time_limit: steps after which an episode is truncated; None: the body's (240 s for the ball).
             threads: threads for physics; the results do not depend on it.

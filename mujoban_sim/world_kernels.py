@@ -11,11 +11,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_sim.bodies import INERTIAL_SIZE, UP_AXIS_SIZE
+from mujoban_core.bodies import INERTIAL_SIZE, UP_AXIS_SIZE
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE
 from mujoban_sim.goals import is_completed
-from mujoban_sim.grid import AGENT, BOX, GRID_SIZE
-from mujoban_sim.rules import BOX_REWARD, SOLVED_REWARD
 from mujoban_sim.scene import BOX_COORDINATES
+from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD
 
 _HALF: Final = (GRID_SIZE - 1) / 2
 

@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from benchmarks.paper.runs import JSON, ResultError
-from mujoban_rl.weights import write_atomically
+from mujoban_core.files import write_atomically
 
 MODULES: Final = ("controller", "planner", "estimator", "termination")
 _FEWEST: Final = 3

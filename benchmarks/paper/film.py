@@ -24,11 +24,11 @@ from benchmarks.paper import runs
 from benchmarks.paper.runs import SEED, ResultError, read_source
 from bringup.command import Choice, Stack
 from bringup.rollout import ticks
-from mujoban_rl.weights import write_atomically
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.grid import CONTROL_PERIOD, Instruction
-from mujoban_sim.plugins import LEARNED, ROLES
+from mujoban_core.files import write_atomically
+from mujoban_core.grid import CONTROL_PERIOD, Instruction
+from mujoban_core.plugins import LEARNED, ROLES
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 NAME: Final = "film_strip"
 RERUN: Final = f"python -m benchmarks.paper.runs --only {NAME}"

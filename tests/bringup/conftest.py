@@ -15,11 +15,11 @@ from bringup.command import Choice, Stack
 from bringup.graph import NODES, InProcess
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
+from mujoban_core.plugins import ROLES
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.conversions import stamp_of, torque_from_msg
-from mujoban_msgs_py.tick_node import live_qos
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.plugins import ROLES
+from mujoban_msgs_py.runtime.tick_node import live_qos
+from mujoban_sokoban.episodes import Episodes
 
 ORACLES = Stack({role: Choice(role, "oracle") for role in ROLES})
 

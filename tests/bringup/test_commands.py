@@ -16,7 +16,7 @@ from bringup.command import run_command
 from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.topics import GRAPH_TOPICS
 from mujoban_sim import rendering
-from mujoban_sim.levels import Level, write_levels
+from mujoban_sokoban.levels import Level, write_levels
 
 ALL_ORACLES = ["--oracle", "estimator,termination,planner,controller"]
 BUT_PLANNER = ["--oracle", "estimator,termination,controller"]

@@ -7,8 +7,8 @@ import torch
 from bringup.command import Choice, Stack
 from bringup.rollout import ticks
 from mujoban_msgs_py.topics import TICK
-from mujoban_sim.episodes import Episodes
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 
 def rolled_out(stack, episodes, time_limit):

@@ -17,7 +17,7 @@ from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.topics import TICK
-from mujoban_sim.episodes import Episodes
+from mujoban_sokoban.episodes import Episodes
 
 MODULES = ("estimator", "termination", "planner", "controller")
 

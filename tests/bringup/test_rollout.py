@@ -9,12 +9,12 @@ from bringup.evaluate import SolvedBar, evaluate
 from bringup.failure import is_unsolvable, playable_region
 from bringup.results import EpisodeResult, Failure, report
 from bringup.rollout import ticks
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.grid import AGENT, BOX, TARGET, WALL, Instruction
-from mujoban_sim.interfaces import Planner
-from mujoban_sim.levels import Level, write_levels
+from mujoban_core.grid import AGENT, BOX, TARGET, WALL, Instruction
+from mujoban_core.interfaces import Planner
 from mujoban_sim.oracles import OracleController, OracleEstimator
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.levels import Level, write_levels
 
 CORNER = """\
 ######

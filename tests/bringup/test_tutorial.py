@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from bringup.rollout import rollout
-from mujoban_sim.episodes import Episodes
+from mujoban_core.plugins import load_module
+from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OracleTermination
-from mujoban_sim.plugins import load_module
-from mujoban_sim.sense_plan_act import SensePlanAct
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "swap_a_planner.md"
 

@@ -12,10 +12,10 @@ from visualization_msgs.msg import Marker, MarkerArray
 from bringup.overlay import BAR, CELL, MARGIN, grid_picture
 from bringup.video import EDGE, VideoNode
 from bringup.viz import VizNode, occupancy_grid
+from mujoban_core.grid import BOX, TARGET, WALL, cell_to_xy
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.observation import GLANCE
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.grid import BOX, TARGET, WALL, cell_to_xy
+from mujoban_sim.observation import GLANCE
+from mujoban_sokoban.episodes import Episodes
 
 LAYERS = ("wall", "target", "agent", "box")
 ENTITIES = {

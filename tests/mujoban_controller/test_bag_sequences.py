@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from bringup.recording import Recorder
 from bringup.rollout import Tick
+from bringup.rollout_recorder import Recorder
 from mujoban_controller.bag_sequences import BagSequences, episodes, open_checked, transitions
 from mujoban_controller.controller import Recurrent, VisuomotorController
 from mujoban_controller.goal_features import privileged_features
@@ -18,15 +18,15 @@ from mujoban_controller.goal_task import GoalTask, GoalTaskConfig, judging_confi
 from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_controller.scripted import scripted_driver
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, TrainingRun
+from mujoban_core.bodies import BALL
+from mujoban_core.grid import INSTRUCTION_LIMIT
+from mujoban_core.interfaces import Observation, TerminationOutput
+from mujoban_core.sense_plan_act import Decision
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
-from mujoban_sim.bodies import BALL
-from mujoban_sim.generator import TRAIN_SEEDS, generate_level
-from mujoban_sim.grid import INSTRUCTION_LIMIT
-from mujoban_sim.interfaces import Observation, TerminationOutput
 from mujoban_sim.oracles import OraclePlanner
-from mujoban_sim.sense_plan_act import Decision
-from mujoban_sim.world import EpisodeSpec
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
 
 STANDSTILL = INSTRUCTION_LIMIT + 5
 LENGTH = STANDSTILL + 100

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from mujoban_controller.controller import VisuomotorController, dead_reckoning, rows_of_sky
+from mujoban_core.bodies import BALL, INERTIAL_SIZE
+from mujoban_core.grid import Instruction
+from mujoban_core.interfaces import ControllerInput
 from mujoban_rl.weights import WeightsError, load_weights, save_weights
-from mujoban_sim.bodies import BALL, INERTIAL_SIZE
-from mujoban_sim.grid import Instruction
-from mujoban_sim.interfaces import ControllerInput
 
 SMALL = {"channels": (4, 8, 8), "features": 16, "hidden": 12}
 

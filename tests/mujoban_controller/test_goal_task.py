@@ -11,9 +11,9 @@ from mujoban_controller.drivers import scripted_driver
 from mujoban_controller.goal_features import feature_size, privileged_features
 from mujoban_controller.goal_task import GoalTask, GoalTaskConfig, judging_config
 from mujoban_controller.judge import SeededEpisodes, judge
+from mujoban_core.grid import Instruction
+from mujoban_core.interfaces import Planner
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.grid import Instruction
-from mujoban_sim.interfaces import Planner
 from mujoban_sim.oracles import OracleController, OraclePlanner
 
 

@@ -11,8 +11,8 @@ from mujoban_controller.instructions import (
     TerminationNoise,
     random_instruction,
 )
+from mujoban_core.grid import Instruction
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.grid import Instruction
 
 KINDS = np.array([GoalKind.HOLD, GoalKind.MOVE, GoalKind.PUSH, GoalKind.HOLD, GoalKind.MOVE])
 FAR = np.full(1, np.inf)

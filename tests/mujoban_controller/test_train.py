@@ -17,10 +17,10 @@ from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
 from mujoban_controller.goal_task import GoalTaskConfig
 from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, TrainingRun, training_episodes
+from mujoban_core.grid import Instruction
 from mujoban_rl.training import RunError
-from mujoban_sim.generator import TRAIN_SEEDS
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.grid import Instruction
+from mujoban_sokoban.generator import TRAIN_SEEDS
 
 TASK = GoalTaskConfig(batch=4, difficulty=1)
 NETWORK = NetworkConfig(channels=(4, 8, 8), features=16, hidden=8)

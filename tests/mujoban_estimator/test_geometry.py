@@ -3,11 +3,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mujoban_core.bodies import BALL
+from mujoban_core.camera import project
+from mujoban_core.grid import GRID_SIZE, cell_to_xy
+from mujoban_core.visibility import cells_in_view
 from mujoban_estimator.geometry import CELLS, cell_geometry
-from mujoban_sim.bodies import BALL
-from mujoban_sim.camera import project
-from mujoban_sim.grid import GRID_SIZE, cell_to_xy
-from mujoban_sim.visibility import cells_in_view
 
 poses = st.tuples(st.floats(-4, 4), st.floats(-4, 4), st.floats(-3.14, 3.14))
 

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 import torch
 
+from mujoban_core.bodies import BALL
+from mujoban_core.grid import AGENT, BOX, Instruction
+from mujoban_core.interfaces import EstimatorInput, TerminationInput, renew_rows
 from mujoban_estimator.estimator import Belief, StateEstimator
 from mujoban_estimator.termination import ControlTermination
 from mujoban_rl.weights import WeightsError, load_weights, save_weights
-from mujoban_sim.bodies import BALL
-from mujoban_sim.grid import AGENT, BOX, Instruction
-from mujoban_sim.interfaces import EstimatorInput, TerminationInput, renew_rows
 
 TICKS = 9
 

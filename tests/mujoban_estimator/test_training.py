@@ -8,9 +8,14 @@ import torch
 from bringup.command import Choice, Stack
 from bringup.exploration import Disturbance
 from bringup.record import Job, MixedEpisodes, record
-from bringup.recording import TOPICS as RECORDED
-from bringup.recording import Recorder
 from bringup.rollout import Tick
+from bringup.rollout_recorder import TOPICS as RECORDED
+from bringup.rollout_recorder import Recorder
+from mujoban_core.bodies import BALL
+from mujoban_core.grid import Instruction
+from mujoban_core.interfaces import GroundTruth, Observation, TerminationOutput
+from mujoban_core.plugins import ROLES
+from mujoban_core.sense_plan_act import Decision
 from mujoban_estimator import load, load_termination
 from mujoban_estimator.bag_stream import ReadReport, endless, find_bags, open_checked, stretches
 from mujoban_estimator.data import Batcher, Stretch
@@ -21,12 +26,7 @@ from mujoban_estimator.termination import TerminationConfig
 from mujoban_estimator.train import Options, TrainConfig, Trainer, learning_rate
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
-from mujoban_sim.bodies import BALL
-from mujoban_sim.generator import TRAIN_SEEDS
-from mujoban_sim.grid import Instruction
-from mujoban_sim.interfaces import GroundTruth, Observation, TerminationOutput
-from mujoban_sim.plugins import ROLES
-from mujoban_sim.sense_plan_act import Decision
+from mujoban_sokoban.generator import TRAIN_SEEDS
 
 SEED = TRAIN_SEEDS.start
 LENGTHS = (7, 12)

@@ -9,9 +9,9 @@ import pytest
 from mujoban_msgs import msg
 from rclpy.serialization import deserialize_message, serialize_message
 
+from mujoban_core.grid import CHANNELS, Instruction
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import TypeRegistry
-from mujoban_sim.grid import CHANNELS, Instruction
 
 MESSAGES = sorted(p.stem for p in (Path(__file__).parents[2] / "mujoban_msgs_py" / "msg").glob("*.msg"))
 

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from mujoban_planner.abstract_env import STEP_REWARD, AbstractEnvironment
 from mujoban_planner.boards import abstract_states
-from mujoban_sim import rules
-from mujoban_sim.generator import generate_batch, generate_level
+from mujoban_sokoban import rules
+from mujoban_sokoban.generator import generate_batch, generate_level
 
 
 def _environment(boards, **options):
@@ -40,7 +40,7 @@ def test_rules_and_rewards_are_those_of_the_simulator(difficulty, seed, actions)
 
 def test_solving_pays_once_and_ends_the_episode():
     level = "#####\n#@$.#\n#####"
-    from mujoban_sim.levels import Level
+    from mujoban_sokoban.levels import Level
 
     env = AbstractEnvironment(1)
     env.reset(torch.tensor([0]), [Level.from_text(level)])

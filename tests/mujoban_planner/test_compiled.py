@@ -13,7 +13,7 @@ from mujoban_planner.export import export, main
 from mujoban_planner.networks import RecurrentPlanner
 from mujoban_planner.play import play
 from mujoban_rl.weights import WeightsError, save_weights
-from mujoban_sim.generator import generate_batch
+from mujoban_sokoban.generator import generate_batch
 
 LEVELS = generate_batch(5, range(1000, 1004))
 

@@ -3,6 +3,8 @@ import pytest
 import torch
 
 import mujoban_planner
+from mujoban_core.grid import GRID_SIZE, Instruction
+from mujoban_core.interfaces import take_rows
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.decision import HISTORY, count_visits, initial_thoughts, initial_visits, recall, remember
 from mujoban_planner.heads import Advice, PlannerHeads
@@ -19,10 +21,8 @@ from mujoban_planner.symmetry import (
 )
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.weights import save_weights
-from mujoban_sim.generator import generate_batch
-from mujoban_sim.grid import GRID_SIZE, Instruction
-from mujoban_sim.interfaces import take_rows
-from mujoban_sim.levels import Level, stack_levels
+from mujoban_sokoban.generator import generate_batch
+from mujoban_sokoban.levels import Level, stack_levels
 
 ALL = torch.arange(SYMMETRIES)[None]
 

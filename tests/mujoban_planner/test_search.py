@@ -11,9 +11,9 @@ from mujoban_planner.lookahead import LookAheadPlanner
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.play import play
 from mujoban_planner.search import search
-from mujoban_sim import rules
-from mujoban_sim.generator import generate_batch, generate_level
-from mujoban_sim.levels import Level, stack_levels, write_levels
+from mujoban_sokoban import rules
+from mujoban_sokoban.generator import generate_batch, generate_level
+from mujoban_sokoban.levels import Level, stack_levels, write_levels
 
 
 @pytest.fixture(scope="module")

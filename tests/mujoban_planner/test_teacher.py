@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from mujoban_core.grid import OFFSETS_RC
 from mujoban_planner import load
 from mujoban_planner.boards import abstract_states, bit_boards, likeliest_boards, state_tensor, take_levels
 from mujoban_planner.lessons import LessonMaker, errs
@@ -12,11 +13,10 @@ from mujoban_planner.propagation import legal_pushes, propagate, walk_to_push
 from mujoban_planner.samples import SampleBuffer, make_batch, unlabelled
 from mujoban_planner.symmetry import SYMMETRIES, view_states
 from mujoban_planner.teacher import DISCOUNT, Teacher, label_deadly
-from mujoban_sim import rules
-from mujoban_sim.generator import generate_batch
-from mujoban_sim.grid import OFFSETS_RC
-from mujoban_sim.levels import Level, stack_levels
-from mujoban_sim.solver import Status, solve_batch
+from mujoban_sokoban import rules
+from mujoban_sokoban.generator import generate_batch
+from mujoban_sokoban.levels import Level, stack_levels
+from mujoban_sokoban.solver import Status, solve_batch
 
 
 @pytest.fixture(scope="module")

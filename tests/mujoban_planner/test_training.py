@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import mujoban_planner
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
 from mujoban_planner import bag_transitions, train
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.decision import count_visits, initial_thoughts, initial_visits
@@ -18,8 +19,7 @@ from mujoban_planner.reinforcement import LevelStream, MPOConfig, MPOTrainer, re
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_rl.weights import WeightsError, save_weights
-from mujoban_sim.generator import TRAIN_SEEDS, generate_batch
-from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 
 SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from mujoban_rl.stats import wilson_interval
+from mujoban_core.stats import wilson_interval
 from mujoban_rl.training import NaNGuard, RunDirectory, RunError, StopSignal, TimeLimit, TrainingLog
 from mujoban_rl.weights import WeightsError, load_weights, record_path, save_weights
 

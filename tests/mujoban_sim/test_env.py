@@ -8,10 +8,10 @@ from gymnasium.vector import AutoresetMode
 
 import mujoban_sim  # noqa: F401 - registers the environment
 from mujoban_sim.env import OBSERVATION_SETS, MujobanEnv
-from mujoban_sim.generator import TEST_SEEDS, generate_level
-from mujoban_sim.levels import Level
 from mujoban_sim.vector_env import MujobanVectorEnv
 from mujoban_sim.world import TorqueError
+from mujoban_sokoban.generator import TEST_SEEDS, generate_level
+from mujoban_sokoban.levels import Level
 
 CORRIDOR = "######\n#@$ .#\n######\n"
 

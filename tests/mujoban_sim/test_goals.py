@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mujoban_core.grid import Instruction, cell_to_xy
 from mujoban_sim.goals import GoalKind, GoalTracker
-from mujoban_sim.grid import Instruction, cell_to_xy
-from mujoban_sim.rules import apply
+from mujoban_sokoban.rules import apply
 
 N, E, S, W, STAY = Instruction.NORTH, Instruction.EAST, Instruction.SOUTH, Instruction.WEST, Instruction.STAY
 

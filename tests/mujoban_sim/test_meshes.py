@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mujoban_core.grid import cell_to_xy, xy_to_cell
 from mujoban_sim.appearance import band_range
-from mujoban_sim.grid import cell_to_xy, xy_to_cell
 from mujoban_sim.meshes import DRAWN_WALL_HEIGHT, MAX_QUADS, level_mesh, skyline_mesh
 from mujoban_sim.scene import PEG_HEIGHT
 

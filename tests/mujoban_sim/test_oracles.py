@@ -1,14 +1,15 @@
 import numpy as np
 import pytest
 
-from mujoban_sim.generator import generate_levels
-from mujoban_sim.grid import Instruction
-from mujoban_sim.interfaces import ControllerInput, Observation, TerminationInput
-from mujoban_sim.levels import Level
+from mujoban_core.grid import Instruction
+from mujoban_core.interfaces import ControllerInput, Observation, TerminationInput
+from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
-from mujoban_sim.sense_plan_act import SensePlanAct
-from mujoban_sim.solver import solve_level
-from mujoban_sim.world import EpisodeSpec, World
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.generator import generate_levels
+from mujoban_sokoban.levels import Level
+from mujoban_sokoban.solver import solve_level
 
 NO_FRAME = np.zeros((1, 1, 1, 3), np.uint8)
 

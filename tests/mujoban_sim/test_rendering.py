@@ -5,12 +5,12 @@ import importlib
 import numpy as np
 import pytest
 
-from mujoban_sim.bodies import BALL
-from mujoban_sim.camera import project
-from mujoban_sim.grid import cell_to_xy
-from mujoban_sim.levels import Level
+from mujoban_core.bodies import BALL
+from mujoban_core.camera import project
+from mujoban_core.grid import cell_to_xy
 from mujoban_sim.rendering import FrameRenderer, RenderingError
 from mujoban_sim.scene import parked_position
+from mujoban_sokoban.levels import Level
 
 OPEN = Level.from_text("""\
 ##########

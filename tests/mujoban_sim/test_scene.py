@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mujoco.batch import Batch
 
-from mujoban_sim.bodies import BALL
-from mujoban_sim.grid import cell_to_xy
+from mujoban_core.bodies import BALL
+from mujoban_core.grid import cell_to_xy
 from mujoban_sim.scene import (
     BOX_MASS,
     PHYSICS_STEP,

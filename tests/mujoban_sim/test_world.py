@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mujoban_sim.bodies import BALL, BODIES, Actuator
-from mujoban_sim.generator import generate_levels
+from mujoban_core.bodies import BALL, BODIES, Actuator
+from mujoban_core.grid import AGENT, BOX, TARGET, WALL, Instruction, cell_to_xy, xy_to_cell
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.grid import AGENT, BOX, TARGET, WALL, Instruction, cell_to_xy, xy_to_cell
-from mujoban_sim.levels import Level
-from mujoban_sim.world import EpisodeSpec, TorqueError, World, initial_heading
+from mujoban_sim.world import TorqueError, World, initial_heading
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.generator import generate_levels
+from mujoban_sokoban.levels import Level
 
 ROOM = Level.from_text("""\
 ##########
@@ -196,7 +197,7 @@ def test_an_episode_does_not_depend_on_history_neighbours_or_threads():
 def test_an_episode_is_the_same_in_every_process():
     code = (
         "import hashlib, numpy as np\n"
-        "from mujoban_sim.generator import generate_level\n"
+        "from mujoban_sokoban.generator import generate_level\n"
         "from mujoban_sim.world import EpisodeSpec, World\n"
         "world = World(1)\n"
         "world.reset([0], [EpisodeSpec(generate_level(5, 11), 11)])\n"

@@ -19,9 +19,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_sim.bitboard import NONE, SIDE, SQUARES, Bits, Int, bit, count, flood, lowest, shift
-from mujoban_sim.grid import DIFFICULTIES, GRID_SIZE, OFFSETS_RC
-from mujoban_sim.levels import Level, LevelBatch
+from mujoban_core.grid import DIFFICULTIES, GRID_SIZE, OFFSETS_RC
+from mujoban_sokoban.bitboard import NONE, SIDE, SQUARES, Bits, Int, bit, count, flood, lowest, shift
+from mujoban_sokoban.levels import Level, LevelBatch
 
 TEST_SEEDS: Final = range(0, 10_000_000)
 """Seeds of what users play and of every evaluation."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.interfaces import (
+from mujoban_core.interfaces import (
     NO_INSTRUCTION,
     Controller,
     ControllerInput,

@@ -15,9 +15,9 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.bodies import BALL
-from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
-from mujoban_sim.interfaces import (
+from mujoban_core.bodies import BALL
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
+from mujoban_core.interfaces import (
     Controller,
     ControllerInput,
     Memory,
@@ -27,7 +27,7 @@ from mujoban_sim.interfaces import (
     put_rows,
     take_rows,
 )
-from mujoban_sim.visibility import cells_in_view
+from mujoban_core.visibility import cells_in_view
 
 LOOK_AROUND_TICKS: Final = 40
 """Ticks in which the ball turns once at `_TURN`; what a learned estimator gets by default."""

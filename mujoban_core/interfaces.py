@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.grid import INSTRUCTION_LIMIT, Instruction
+from mujoban_core.grid import INSTRUCTION_LIMIT, Instruction
 
 Memory = tuple[Any, ...]
 """A module's recurrent state: arrays or tensors with the batch on the first axis."""
@@ -30,7 +30,7 @@ class Observation(NamedTuple):
     frame: NDArray[np.uint8]
     """o_cam, first-person camera, RGB [B, 64, 64, 3]."""
     proprio: NDArray[np.float32]
-    """o_pr, [B, P]; layout in `mujoban_sim.bodies`."""
+    """o_pr, [B, P]; layout in `mujoban_core.bodies`."""
     pose: NDArray[np.float32]
     """o_pos = (x [m], y [m], psi [rad]) in the map frame, [B, 3]."""
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mujoban_sim.generator import generate_level
-from mujoban_sim.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
-from mujoban_sim.levels import Level, LevelError, read_levels, stack_levels, write_levels
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
+from mujoban_sokoban.generator import generate_level
+from mujoban_sokoban.levels import Level, LevelError, read_levels, stack_levels, write_levels
 
 BOXOBAN = """\
 ; 0

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mujoban_sim.bodies import BALL, BODIES, FIRST_PERSON_CAMERA, INERTIAL_SIZE, get_body
+from mujoban_core.bodies import BALL, BODIES, FIRST_PERSON_CAMERA, INERTIAL_SIZE, get_body
 from mujoban_sim.scene import scene_mjcf
 
 

@@ -26,7 +26,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
+from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
 
 SYMBOLS: Final = "# @$.*+"
 """Every symbol that a level text may contain."""

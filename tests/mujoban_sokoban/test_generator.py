@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mujoban_sim.generator import TEST_SEEDS, TRAIN_SEEDS, generate_batch, generate_level, generate_levels
-from mujoban_sim.grid import DIFFICULTIES, GRID_SIZE, OFFSETS_RC
-from mujoban_sim.levels import stack_levels
-from mujoban_sim.solver import Status, solve_batch
+from mujoban_core.grid import DIFFICULTIES, GRID_SIZE, OFFSETS_RC
+from mujoban_sokoban.generator import TEST_SEEDS, TRAIN_SEEDS, generate_batch, generate_level, generate_levels
+from mujoban_sokoban.levels import stack_levels
+from mujoban_sokoban.solver import Status, solve_batch
 
 difficulties = st.sampled_from(sorted(DIFFICULTIES))
 

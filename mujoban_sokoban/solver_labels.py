@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_sim.bitboard import (
+from mujoban_sokoban.bitboard import (
     NONE,
     SIDE,
     SQUARE_STEP,
@@ -23,7 +23,7 @@ from mujoban_sim.bitboard import (
     spread,
     to_square,
 )
-from mujoban_sim.solver_search import SOLVED, Workspace, search
+from mujoban_sokoban.solver_search import SOLVED, Workspace, search
 
 _UNREACHED = 127
 

@@ -6,14 +6,14 @@ import pytest
 from mujoban_msgs.msg import AbstractState
 from rclpy.serialization import deserialize_message
 
-from bringup.recorder import RecorderNode
+from bringup.graph_recorder import RecorderNode
 from bringup.stack import PlayOptions, play
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, open_bag
 from mujoban_msgs_py.conversions import stamp_of
-from mujoban_msgs_py.tick_node import live_qos
+from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, SIMULATOR_TOPICS, TICK
-from mujoban_sim.episodes import Episodes
+from mujoban_sokoban.episodes import Episodes
 
 
 def contents(path):

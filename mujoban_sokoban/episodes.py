@@ -4,18 +4,25 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import overload
 
 import numpy as np
 
-from mujoban_sim.generator import generate_level
-from mujoban_sim.grid import DIFFICULTIES
-from mujoban_sim.levels import Level, read_levels
-from mujoban_sim.rules import apply
-from mujoban_sim.world import EpisodeSpec
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_sokoban.generator import generate_level
+from mujoban_sokoban.levels import Level, read_levels
+from mujoban_sokoban.rules import apply
+
+
+@dataclass(frozen=True)
+class EpisodeSpec:
+    """What fixes an episode: the level, and the seed of initial heading and appearance."""
+
+    level: Level
+    seed: int
 
 
 def after_moves(level: Level, moves: Iterable[int]) -> Level:

@@ -15,13 +15,13 @@ from typing import Any, Final, Self
 from rclpy.serialization import serialize_message
 
 from bringup.rollout import Tick
+from mujoban_core.bodies import Body
+from mujoban_core.camera import camera_intrinsics
+from mujoban_core.grid import BOX, TARGET
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.topics import TICK, Topic
-from mujoban_sim.bodies import Body
-from mujoban_sim.camera import camera_intrinsics
-from mujoban_sim.grid import BOX, TARGET
-from mujoban_sim.world import EpisodeSpec
+from mujoban_sokoban.episodes import EpisodeSpec
 
 TOPICS: Final = tuple(t for t in (*topics.SIMULATOR_TOPICS, *topics.MODULE_TOPICS) if t is not topics.TOP_CAMERA)
 """What is recorded by default."""

@@ -19,8 +19,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.camera import CameraMount
-from mujoban_sim.grid import TIME_LIMIT
+from mujoban_core.camera import CameraMount
+from mujoban_core.grid import TIME_LIMIT
 
 FIRST_PERSON_CAMERA: Final = "first_person"
 """Name of the camera that every body carries; it yields o_cam."""

@@ -1,6 +1,6 @@
 """Solve Sokoban levels, optimally in player moves or faster and nearly so, and label states for imitation.
 
-The search is in `mujoban_sim.solver_search`. Everything here releases the GIL while it works, and takes any number
+The search is in `mujoban_sokoban.solver_search`. Everything here releases the GIL while it works, and takes any number
 of boxes on any closed grid of up to N x N cells.
 
 Shapes: B levels, K boxes, N = `grid.GRID_SIZE`, S labelled states.
@@ -15,12 +15,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mujoban_sim import solver_search
-from mujoban_sim.bitboard import to_square
-from mujoban_sim.grid import GRID_SIZE, Instruction
-from mujoban_sim.levels import Level, LevelBatch, stack_levels
-from mujoban_sim.solver_labels import label_batch, moves_of, search_batch, squares_of
-from mujoban_sim.solver_search import make_workspace
+from mujoban_core.grid import GRID_SIZE, Instruction
+from mujoban_sokoban import solver_search
+from mujoban_sokoban.bitboard import to_square
+from mujoban_sokoban.levels import Level, LevelBatch, stack_levels
+from mujoban_sokoban.solver_labels import label_batch, moves_of, search_batch, squares_of
+from mujoban_sokoban.solver_search import make_workspace
 
 MAX_NODES: Final = 250_000
 """States that a search stores by default; enough for more than 99.9 % of levels of difficulty 5."""

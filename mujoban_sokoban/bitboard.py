@@ -16,7 +16,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from mujoban_sim.grid import GRID_SIZE
+from mujoban_core.grid import GRID_SIZE
 
 SIDE: Final = GRID_SIZE - 2
 """Rows and columns of the board."""

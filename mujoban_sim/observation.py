@@ -9,10 +9,11 @@ from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from std_msgs.msg import Header
 
+from mujoban_core.camera import camera_intrinsics
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.topics import Topic
-from mujoban_sim.camera import camera_intrinsics
-from mujoban_sim.world import EpisodeSpec, World
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import EpisodeSpec
 
 _NEEDED = (topics.EPISODE, topics.CAMERA, topics.PROPRIO, topics.POSE)
 """What the modules cannot do without."""

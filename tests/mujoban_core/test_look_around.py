@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from bringup.rollout import ticks
-from mujoban_sim.episodes import Episodes
-from mujoban_sim.grid import AGENT, BOX, WALL, Instruction
-from mujoban_sim.look_around import LOOK_AROUND_TICKS, LookAroundPlanner, look_around, step_to_view
+from mujoban_core.grid import AGENT, BOX, WALL, Instruction
+from mujoban_core.look_around import LOOK_AROUND_TICKS, LookAroundPlanner, look_around, step_to_view
+from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
-from mujoban_sim.sense_plan_act import SensePlanAct
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 NOTHING_SEEN = np.zeros((10, 10), np.bool_)
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mujoban_sim.generator import generate_batch, generate_level
-from mujoban_sim.grid import Instruction
-from mujoban_sim.levels import Level, LevelBatch, stack_levels
-from mujoban_sim.rules import apply
-from mujoban_sim.solver import (
+from mujoban_core.grid import Instruction
+from mujoban_sokoban.generator import generate_batch, generate_level
+from mujoban_sokoban.levels import Level, LevelBatch, stack_levels
+from mujoban_sokoban.rules import apply
+from mujoban_sokoban.solver import (
     ABSENT,
     Status,
     demonstrations,
@@ -238,7 +238,7 @@ def test_the_same_generator_state_gives_the_same_demonstrations():
 
 def test_compiled_code_is_shared_by_concurrent_processes():
     program = f"import sys; sys.path.insert(0, {sys.path[0]!r})\n"
-    program += "from mujoban_sim.generator import generate_level; from mujoban_sim.solver import solve_level\n"
+    program += "from mujoban_sokoban.generator import generate_level; from mujoban_sokoban.solver import solve_level\n"
     program += "print(len(solve_level(generate_level(5, 1)).moves))"
     running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) for _ in range(3)]
     answers = {process.communicate(timeout=100)[0].strip() for process in running}

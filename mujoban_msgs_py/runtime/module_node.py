@@ -1,4 +1,4 @@
-"""The base of the four module nodes: a `TickNode` around a module of `mujoban_sim.interfaces`."""
+"""The base of the four module nodes: a `TickNode` around a module of `mujoban_core.interfaces`."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from mujoban_msgs.msg import Episode
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.parameter import Parameter
 
+from mujoban_core.interfaces import GroundTruth
+from mujoban_core.look_around import LOOKING_ROLES, look_around
+from mujoban_core.plugins import LEARNED, load_module
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.tick_node import Input, Output, TickNode
-from mujoban_sim.interfaces import GroundTruth
-from mujoban_sim.look_around import LOOKING_ROLES, look_around
-from mujoban_sim.plugins import LEARNED, load_module
+from mujoban_msgs_py.runtime.tick_node import Input, Output, TickNode
 
 TRUTH_INPUTS = (
     Input(topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_from_msg),

@@ -1,4 +1,4 @@
-"""A* over pushes that minimises the player's moves: the numba kernels behind `mujoban_sim.solver`.
+"""A* over pushes that minimises the player's moves: the numba kernels behind `mujoban_sokoban.solver`.
 
 A search state is the set of boxes and the player's square; an edge is a walk and one push, and costs its moves. The
 heuristic is the least number of pushes that brings every box to a target of its own, boxes moving freely past each
@@ -16,7 +16,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_sim.bitboard import NONE, ONE, SQUARE_STEP, SQUARES, Bits, Int, bit, count, frozen, lowest, shift, spread
+from mujoban_sokoban.bitboard import (
+    NONE,
+    ONE,
+    SQUARE_STEP,
+    SQUARES,
+    Bits,
+    Int,
+    bit,
+    count,
+    frozen,
+    lowest,
+    shift,
+    spread,
+)
 
 SOLVED: Final = 1
 UNSOLVABLE: Final = 2

@@ -3,10 +3,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mujoban_sim.generator import generate_batch, generate_level
-from mujoban_sim.grid import Instruction
-from mujoban_sim.levels import Level
-from mujoban_sim.rules import BOX_REWARD, SOLVED_REWARD, apply
+from mujoban_core.grid import Instruction
+from mujoban_sokoban.generator import generate_batch, generate_level
+from mujoban_sokoban.levels import Level
+from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD, apply
 
 OPPOSITE = {
     Instruction.NORTH: Instruction.SOUTH,

@@ -9,8 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_sim.camera import CameraMount
-from mujoban_sim.grid import GRID_SIZE
+from mujoban_core.camera import CameraMount
+from mujoban_core.grid import GRID_SIZE
 
 _RAYS: Final = 33
 _STEP: Final = 0.15

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from mujoban_sim.grid import OFFSETS_RC, Instruction
+from mujoban_core.grid import OFFSETS_RC, Instruction
 
 BOX_REWARD: Final = 1.0
 """Reward of pushing a box onto a target, and penalty of pushing it off."""

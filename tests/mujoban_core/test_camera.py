@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mujoban_sim.bodies import BALL, FIRST_PERSON_CAMERA, ROBOT_DEFAULTS
-from mujoban_sim.camera import camera_extrinsics, camera_intrinsics, in_view, project
+from mujoban_core.bodies import BALL, FIRST_PERSON_CAMERA, ROBOT_DEFAULTS
+from mujoban_core.camera import camera_extrinsics, camera_intrinsics, in_view, project
 
 poses = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-7, 7)).map(np.array)
 points = st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(0, 2)).map(np.array)

@@ -1,4 +1,4 @@
-"""The node that records the graph into a bag (`python -m bringup.recorder --ros-args -p path:=DIR`)."""
+"""The node that records the graph into a bag (`python -m bringup.graph_recorder --ros-args -p path:=DIR`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rclpy.node import Node
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.raw import raw_stamp, read
-from mujoban_msgs_py.tick_node import live_qos, run_node
+from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
 
 HELD_TICKS = 40

@@ -1,0 +1,103 @@
+"""Find the module that plays a role: the learned one, its oracle, or a class of the user's own.
+
+Packages offer modules through entry points of the group `mujoban.modules`, named `ROLE.NAME`, so that nothing here
+knows a package downstream. `learned` and `oracle` are such names; a distribution of the user's own may add others,
+which every program then accepts: `--planner NAME`. An entry point leads to a module's class, whose instances are made
+without arguments, or to a function `(weights, device) -> Module`. `ROLE.weights` leads to the weights that ship.
+"""
+
+from __future__ import annotations
+
+import importlib
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, Final
+
+from mujoban_core.interfaces import Controller, Estimator, Module, Planner, Termination
+
+LEARNED: Final = "learned"
+ORACLE: Final = "oracle"
+
+GROUP: Final = "mujoban.modules"
+"""The entry points' group."""
+
+ROLES: Final[dict[str, type[Module]]] = {
+    "estimator": Estimator,
+    "termination": Termination,
+    "planner": Planner,
+    "controller": Controller,
+}
+"""The four places in sense-plan-act and the interface of each."""
+
+_SHIPPED: Final = "weights"
+
+
+class PluginError(ValueError):
+    """A module cannot be found or does not fit its role."""
+
+
+def load_module(role: str, source: str = LEARNED, weights: Path | None = None, device: str = "cpu") -> Module:
+    """Return the module for a role.
+
+    Args:
+        role: One of `ROLES`.
+        source: Name of an entry point of the role ("learned", "oracle"), or `package.module:Class`, whose instances
+            are made without arguments.
+        weights: Weights of the learned module instead of those that ship.
+        device: Device of the learned module.
+
+    Raises:
+        PluginError: If the role or the class is unknown, or an instance is not of the role's interface.
+        ValueError: If weights are missing or damaged.
+    """
+    interface = _interface(role)
+    make = _resolve(source) if ":" in source else _load(role, source)
+    module = make() if ":" in source or isinstance(make, type) else make(weights, device)
+    if not isinstance(module, interface):
+        expected = f"{interface.__module__}.{interface.__name__}"
+        raise PluginError(f"{source} is a {type(module).__name__}: the {role} must be a {expected}")
+    return module
+
+
+def shipped_weights(role: str) -> Path:
+    """Return where the weights of the learned module for a role are."""
+    _interface(role)
+    return Path(_load(role, _SHIPPED))
+
+
+def _interface(role: str) -> type[Module]:
+    try:
+        return ROLES[role]
+    except KeyError:
+        raise PluginError(f"unknown module {role!r}: expected one of {', '.join(ROLES)}") from None
+
+
+@cache
+def _offered() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def _load(role: str, name: str) -> Any:
+    """Return what the entry point `ROLE.NAME` leads to."""
+    entry = _offered().get(f"{role}.{name}")
+    if entry is None:
+        names = sorted(n.partition(".")[2] for n in _offered() if n.startswith(f"{role}."))
+        known = ", ".join(n for n in names if n != _SHIPPED) or "none is installed: run make setup"
+        raise PluginError(f"no {role} is named {name!r}: expected package.module:Class or one of {known}")
+    try:
+        return entry.load()
+    except (ImportError, AttributeError) as error:
+        raise PluginError(f"{role} {name!r} ({entry.value}): {error}") from error
+
+
+def _resolve(name: str) -> Any:
+    module, colon, attribute = name.partition(":")
+    if not (module and colon and attribute):
+        raise PluginError(f"{name!r} names no class: expected package.module:Class")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except ModuleNotFoundError as error:
+        raise PluginError(f"{name!r}: {error}") from error
+    except AttributeError as error:
+        raise PluginError(f"{name!r}: {module} has no {attribute}") from error

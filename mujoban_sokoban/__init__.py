@@ -1,0 +1,1 @@
+"""The puzzle: levels, rules, bitboards, generator, solver."""
