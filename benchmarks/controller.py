@@ -28,8 +28,8 @@ from mujoban_controller.goal_task import GoalTaskConfig
 from mujoban_controller.train import TrainConfig, make_learner
 from mujoban_core.grid import GRID_SIZE, xy_to_cell
 from mujoban_core.interfaces import ControllerInput
+from mujoban_rl.limits import StopSignal
 from mujoban_rl.mpo_continuous import MPOConfig, MPOLoss, td_target
-from mujoban_rl.training import StopSignal
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import generate_level

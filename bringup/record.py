@@ -22,7 +22,7 @@ from bringup.exploration import Disturbance, disturbed
 from bringup.rollout import ticks
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.sense_plan_act import SensePlanAct
-from mujoban_rl.training import StopSignal
+from mujoban_rl.limits import StopSignal
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec, LazyEpisodes, after_moves
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level

@@ -28,7 +28,9 @@ from mujoban_controller.judge import OutcomeSummary, judge
 from mujoban_controller.learners import DistilLearner, Learner, ReinforcementLearner
 from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_controller.privileged import PrivilegedPolicy
-from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
+from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.training_log import TrainingLog
 from mujoban_rl.weights import digest, load_weights, provenance, save_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sokoban.episodes import EpisodeSpec, after_moves

@@ -24,7 +24,9 @@ from mujoban_estimator.bag_stream import ReadReport, endless, find_bags, open_ch
 from mujoban_estimator.data import Batch, Batcher
 from mujoban_estimator.evaluate import evaluate
 from mujoban_estimator.learner import Learner, LearnerConfig
-from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
+from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.training_log import TrainingLog
 from mujoban_rl.weights import load_weights, provenance, save_weights
 
 

@@ -23,7 +23,9 @@ from mujoban_planner.samples import Batch, SampleBuffer, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares, solve_rates
-from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
+from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.training_log import TrainingLog
 from mujoban_rl.weights import provenance, save_weights
 
 _STOCK_BATCHES = 800

@@ -28,9 +28,11 @@ from mujoban_planner.boards import abstract_states
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.teacher import DISCOUNT
 from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares, solve_rates
+from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
 from mujoban_rl.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
 from mujoban_rl.replay import TimeMajorReplay, windowed_returns
-from mujoban_rl.training import NaNGuard, RunDirectory, StopSignal, TimeLimit, TrainingLog
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.training_log import TrainingLog
 from mujoban_rl.weights import digest, provenance, save_weights
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 

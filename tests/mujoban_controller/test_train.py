@@ -18,7 +18,7 @@ from mujoban_controller.goal_task import GoalTaskConfig
 from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, TrainingRun, training_episodes
 from mujoban_core.grid import Instruction
-from mujoban_rl.training import RunError
+from mujoban_rl.run_directory import RunError
 from mujoban_sim.goals import GoalKind
 from mujoban_sokoban.generator import TRAIN_SEEDS
 

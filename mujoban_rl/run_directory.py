@@ -1,44 +1,22 @@
-"""What every trainer needs: run directory, checkpoints, NaN guard, stop signal, log and progress.
-
-A typical trainer::
-
-    run = RunDirectory(options.run, config)
-    log, guard = TrainingLog(run, total=options.steps), NaNGuard()
-    step = 0
-    if (snapshot := run.load(modules={"policy": policy}, optimisers={"adam": adam})) is not None:
-        step = snapshot.step
-    with StopSignal() as stop, TimeLimit(options.seconds) as limit:
-        while step < options.steps and not stop.requested and not limit.reached:
-            loss = ...
-            if guard.accept(loss):
-                ...
-            log.scalars(step, {"loss": loss})
-    run.save(step, modules=..., optimisers=..., extra={"rng": rng.bit_generator.state})
-"""
+"""The directory of a training run: configuration, checkpoints, learning curve."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-import math
-import signal
-import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as dump_tensors
 from torch import Tensor, nn
-from torch.utils.tensorboard.writer import SummaryWriter
-from tqdm import tqdm
 
 from mujoban_core.files import write_atomically
-from mujoban_rl.weights import WeightsError, check_finite
+from mujoban_rl.weights import check_finite
 
 
 class RunError(ValueError):
@@ -206,132 +184,3 @@ def _join_optimiser(moments: Mapping[str, Tensor], scalars: dict[str, Any]) -> d
         index, key = name.split("/", 1)
         state.setdefault(int(index), {})[key] = value
     return {"state": state, "param_groups": scalars["param_groups"]}
-
-
-class NaNGuard:
-    """Keep non-finite updates away from the weights; give up when they do not stop."""
-
-    def __init__(self, patience: int = 20) -> None:
-        """Tolerate at most `patience` non-finite steps in a row."""
-        self.patience = patience
-        self.skipped = 0
-        """Steps refused so far."""
-        self._in_a_row = 0
-
-    def accept(self, *values: Tensor | float) -> bool:
-        """Return whether all values (losses, gradient norm) are finite; if not, the step must be skipped.
-
-        Raises:
-            FloatingPointError: After `patience` refusals in a row.
-        """
-        finite = all(
-            bool(torch.isfinite(v).all()) if isinstance(v, Tensor) else math.isfinite(v) for v in values
-        )
-        self._in_a_row = 0 if finite else self._in_a_row + 1
-        self.skipped += not finite
-        if self._in_a_row > self.patience:
-            raise FloatingPointError(f"training diverged: {self._in_a_row} non-finite steps in a row")
-        return finite
-
-
-class StopSignal:
-    """Context in which SIGINT and SIGTERM ask the loop to end instead of killing it."""
-
-    _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-    def __init__(self) -> None:
-        self.requested = False
-        """Whether a signal came; a second SIGINT interrupts at once."""
-        self._previous: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> Self:
-        """Install the handlers."""
-        self._previous = {s: signal.signal(s, self._handle) for s in self._SIGNALS}
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Put the former handlers back."""
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.requested and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.requested = True
-
-
-class TimeLimit:
-    """Wall-clock limit of one bit of a run."""
-
-    def __init__(self, seconds: float | None) -> None:
-        """Count from now; None never ends."""
-        self._seconds = math.inf if seconds is None else seconds
-        self._start = time.monotonic()
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the limit was made."""
-        return time.monotonic() - self._start
-
-    @property
-    def reached(self) -> bool:
-        """Whether the time is up."""
-        return self.elapsed >= self._seconds
-
-
-class TrainingLog:
-    """Progress bar, TensorBoard events and `metrics.jsonl` (the source of learning curves) of a run."""
-
-    def __init__(self, run: RunDirectory, *, total: int | None = None, initial: int = 0, unit: str = "step") -> None:
-        """Append to the run's files; `total` and `initial` are in `unit`s of the progress bar."""
-        self._writer = SummaryWriter(str(run.path / "tensorboard"))
-        self._file = (run.path / "metrics.jsonl").open("a", encoding="utf-8")
-        self._bar = tqdm(total=total, initial=initial, unit=unit, dynamic_ncols=True, mininterval=1.0)
-
-    def advance(self, n: int = 1) -> None:
-        """Move the progress bar."""
-        self._bar.update(n)
-
-    def scalars(self, step: int, values: Mapping[str, float | Tensor]) -> None:
-        """Write scalars to TensorBoard and `metrics.jsonl`, and show the first few in the progress bar."""
-        numbers = {k: float(v) for k, v in values.items()}
-        for name, value in numbers.items():
-            self._writer.add_scalar(name, value, step)
-        finite = {k: v if math.isfinite(v) else None for k, v in numbers.items()}
-        self._file.write(json.dumps({"step": step, "time": round(time.time(), 1), **finite}) + "\n")
-        self._file.flush()
-        self._bar.set_postfix({k.rsplit("/")[-1]: f"{v:.3g}" for k, v in list(numbers.items())[:5]}, refresh=False)
-
-    def message(self, text: str) -> None:
-        """Print a line without breaking the progress bar."""
-        self._bar.write(text)
-
-    def close(self) -> None:
-        """Flush and close everything."""
-        self._bar.close()
-        self._writer.close()
-        self._file.close()
-
-    def __enter__(self) -> Self:
-        """Return the log itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the log."""
-        self.close()
-
-
-__all__ = [
-    "NaNGuard",
-    "RunDirectory",
-    "RunError",
-    "Snapshot",
-    "StopSignal",
-    "TimeLimit",
-    "TrainingLog",
-    "WeightsError",
-]

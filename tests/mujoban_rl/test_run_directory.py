@@ -7,7 +7,9 @@ import torch
 from torch import nn
 
 from mujoban_core.stats import wilson_interval
-from mujoban_rl.training import NaNGuard, RunDirectory, RunError, StopSignal, TimeLimit, TrainingLog
+from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
+from mujoban_rl.run_directory import RunDirectory, RunError
+from mujoban_rl.training_log import TrainingLog
 from mujoban_rl.weights import WeightsError, load_weights, record_path, save_weights
 
 

@@ -1,0 +1,356 @@
+"""The one training loop of the project: a `Learner` learns from the batches of a `Source`; a `Trainer` drives both.
+
+What every training needs stands here once: limits, cadence, progress, learning curve, checkpoints, resuming, stop
+signals. What is particular stands in two classes::
+
+    class MyLearner(Learner[Batch]): ...   # networks, loss, optimisers: update(batch)
+    class MySource(Source[Batch]): ...     # bags, lessons, replay fed by actors: next_batch()
+
+    directory = RunDirectory(options.run, config)
+    Trainer(directory, MyLearner(config), MySource(config), budget, cadence).run(limit_seconds=options.seconds)
+
+A run that stops, by a limit or a signal, and goes on from its checkpoint ends as one that never stopped: to the bit on
+a CPU, if learner and source keep everything that changes in `modules`, `optimisers` and `state`.
+"""
+
+from __future__ import annotations
+
+import math
+import resource
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
+from mujoban_rl.run_directory import RunDirectory, Snapshot
+from mujoban_rl.training_log import TrainingLog
+
+BatchT = TypeVar("BatchT")
+Scalars = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class State:
+    """What changes in a part of a run beside its modules and optimisers."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    """JSON values: random states, counters."""
+    tensors: dict[str, Tensor] = field(default_factory=dict)
+    """Replay, recurrent states, `torch.Generator` states."""
+
+
+class _Part(ABC):  # noqa: B024 - all of it has a default
+    """What learners and sources have in common: all of it is restored from a checkpoint."""
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """Everything with weights, by name."""
+        return {}
+
+    @property
+    def optimisers(self) -> Mapping[str, Optimizer]:
+        """Optimisers by name."""
+        return {}
+
+    def state(self) -> State:
+        """Return what else changes during the run."""
+        return State()
+
+    def restore(self, state: State) -> None:  # noqa: B027 - most learners have no such state
+        """Take over what `state` returned; modules and optimisers have been restored already."""
+
+
+class Learner(_Part, Generic[BatchT]):
+    """Networks, their loss and their optimisers."""
+
+    @abstractmethod
+    def update(self, batch: BatchT, progress: float, guard: NaNGuard) -> Scalars:
+        """Learn from one batch and return what to log; the numbers of several updates are averaged.
+
+        Every step of an optimiser goes through `mujoban_rl.optimise.guarded_step`, so that a batch that gives a
+        number that is not finite leaves weights, dual variables and optimisers as they were.
+
+        Args:
+            batch: From the source.
+            progress: Share of the budget that is spent, in [0, 1): what schedules depend on.
+            guard: Decides whether a step is taken.
+        """
+
+    def weights(self) -> Mapping[str, Tensor]:
+        """Return what actors need to act, by name; nothing by default."""
+        return {}
+
+    def evaluate(self) -> Scalars:
+        """Return how good the product is on validation levels; must leave all states as they are."""
+        return {}
+
+    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
+        """Write the weights that the run is for, with their record, into the run's directory."""
+
+
+class Source(_Part, Generic[BatchT]):
+    """Where batches come from."""
+
+    samples: int = 0
+    """Environment steps, or samples where there is no environment, so far: what learning curves are drawn against."""
+
+    @abstractmethod
+    def next_batch(self) -> BatchT | None:
+        """Return the next batch, collecting experience where that is due; None when there is no more."""
+
+    def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
+        """Hand the newest weights to those who act; `version` is the number of updates behind them."""
+
+    def statistics(self) -> Scalars:
+        """Return what to log of the experience since the last call."""
+        return {}
+
+    def worker_cpu_seconds(self) -> float:
+        """Return the CPU time that processes of this source have used so far in this bit of the run."""
+        return 0.0
+
+    def close(self) -> None:
+        """End processes and close files."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a run may spend; schedules follow whichever share is spent most. All bits of the run count together."""
+
+    samples: float = math.inf
+    updates: float = math.inf
+    seconds: float = math.inf
+    """Wall-clock seconds of training; makes schedules, and so the run, depend on the machine."""
+
+    def __post_init__(self) -> None:
+        """Reject budgets that are no amounts."""
+        for name in ("samples", "updates", "seconds"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"budget of {getattr(self, name)} {name}: expected a positive number")
+
+
+@dataclass(frozen=True)
+class Cadence:
+    """How often a run logs, publishes, evaluates and saves."""
+
+    log_updates: int = 100
+    publish_updates: int = 10
+    evaluate_samples: float = math.inf
+    """Samples between evaluations; the end of the budget is always evaluated."""
+    save_seconds: float = 120.0
+
+
+@dataclass
+class Progress:
+    """What a run has spent so far, in all its bits together."""
+
+    updates: int = 0
+    samples: int = 0
+    seconds: float = 0.0
+    """Wall-clock."""
+    cpu_seconds: float = 0.0
+    """Of all processes of the run."""
+
+    def share(self, budget: Budget) -> float:
+        """Return the share of the budget that is spent."""
+        return max(self.samples / budget.samples, self.updates / budget.updates, self.seconds / budget.seconds)
+
+
+class Trainer(Generic[BatchT]):
+    """Drives a learner and a source until the budget is spent, in as many bits as it takes."""
+
+    def __init__(
+        self,
+        directory: RunDirectory,
+        learner: Learner[BatchT],
+        source: Source[BatchT],
+        budget: Budget,
+        cadence: Cadence | None = None,
+        *,
+        record: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Restore the newest checkpoint of the directory, if there is one.
+
+        Args:
+            directory: The run's directory, opened with its configuration.
+            learner: What learns.
+            source: What it learns from.
+            budget: When the run is complete.
+            cadence: How often it logs, evaluates and saves.
+            record: What the weights' record says beside progress and metrics (see `mujoban_rl.weights.provenance`).
+
+        Raises:
+            RunError: If there are checkpoints but none is intact.
+        """
+        self.directory, self.learner, self.source = directory, learner, source
+        self.budget, self.cadence = budget, cadence or Cadence()
+        self.progress = Progress()
+        self.metrics: dict[str, float] = {}
+        """Of the last evaluation."""
+        self._record = dict(record or {})
+        self._guard = NaNGuard()
+        self._restore()
+
+    @property
+    def complete(self) -> bool:
+        """Whether the budget is spent."""
+        return self.progress.share(self.budget) >= 1.0
+
+    def run(self, *, limit_seconds: float | None = None) -> bool:
+        """Train until the budget or `limit_seconds` is spent, the source has no more, or a signal comes; then save.
+
+        Returns:
+            Whether the run is complete.
+        """
+        samples = self.budget.samples
+        total = None if math.isinf(samples) else int(samples)
+        try:
+            with (
+                TrainingLog(self.directory, total=total, initial=self.progress.samples, unit="sample") as log,
+                StopSignal() as stop,
+            ):
+                spent = self._loop(log, stop, TimeLimit(limit_seconds))
+                if spent:
+                    self._evaluate(log)
+                self.save()
+        finally:
+            self.source.close()
+        return spent
+
+    def _loop(self, log: TrainingLog, stop: StopSignal, limit: TimeLimit) -> bool:
+        """Train; return whether it ended because nothing is left to do."""
+        cadence, progress, source = self.cadence, self.progress, self.source
+        clock, meter = _Clock(progress, source), _Meter()
+        saved = limit.elapsed
+        if not self.complete:
+            source.publish(self.learner.weights(), progress.updates)
+        while not self.complete:
+            if stop.requested or limit.reached:
+                return False
+            batch = source.next_batch()
+            if batch is None:
+                return True
+            meter.add(self.learner.update(batch, progress.share(self.budget), self._guard))
+            before, progress.samples = progress.samples, source.samples
+            progress.updates += 1
+            clock.tick()
+            log.advance(progress.samples - before)
+            if progress.updates % cadence.publish_updates == 0:
+                source.publish(self.learner.weights(), progress.updates)
+            if progress.updates % cadence.log_updates == 0:
+                log.scalars(progress.samples, {**meter.take(), **source.statistics(), **self._spent()})
+            if progress.samples // cadence.evaluate_samples > before // cadence.evaluate_samples:
+                self._evaluate(log)
+                clock.skip()
+            if limit.elapsed - saved > cadence.save_seconds:
+                saved = limit.elapsed
+                self.save()
+        return True
+
+    def _evaluate(self, log: TrainingLog) -> None:
+        self.metrics = dict(self.learner.evaluate())
+        if not self.metrics:
+            return
+        log.scalars(self.progress.samples, {f"evaluation/{k}": v for k, v in self.metrics.items()} | self._spent())
+        shown = ", ".join(f"{k} {v:.4g}" for k, v in self.metrics.items())
+        log.message(f"{self.progress.samples} samples, {self.progress.cpu_seconds:.0f} CPU s: {shown}")
+
+    def _spent(self) -> dict[str, float]:
+        progress = self.progress
+        return {
+            "updates": progress.updates,
+            "seconds": progress.seconds,
+            "cpu_seconds": progress.cpu_seconds,
+            "refused_updates": self._guard.skipped,
+        }
+
+    def save(self) -> None:
+        """Write a checkpoint, and export the weights with their record."""
+        parts = {"learner": self.learner, "source": self.source}
+        states = {name: part.state() for name, part in parts.items()}
+        self.directory.save(
+            self.progress.updates,
+            modules={f"{name}.{k}": v for name, part in parts.items() for k, v in part.modules.items()},
+            optimisers={f"{name}.{k}": v for name, part in parts.items() for k, v in part.optimisers.items()},
+            extra={
+                "progress": vars(self.progress),
+                "metrics": self.metrics,
+                "skipped": self._guard.skipped,
+                **{name: state.values for name, state in states.items()},
+            },
+            tensors={f"{name}.{k}": v for name, state in states.items() for k, v in state.tensors.items()},
+        )
+        record = {**self._record, **vars(self.progress), "metrics": self.metrics}
+        self.learner.export(self.directory, record)
+
+    def _restore(self) -> None:
+        parts = {"learner": self.learner, "source": self.source}
+        snapshot = self.directory.load(
+            modules={f"{name}.{k}": v for name, part in parts.items() for k, v in part.modules.items()},
+            optimisers={f"{name}.{k}": v for name, part in parts.items() for k, v in part.optimisers.items()},
+        )
+        if snapshot is None:
+            return
+        self.progress = Progress(**snapshot.extra["progress"])
+        self.metrics = snapshot.extra["metrics"]
+        self._guard.skipped = snapshot.extra["skipped"]
+        for name, part in parts.items():
+            part.restore(_state_of(snapshot, name))
+        self.source.samples = self.progress.samples
+
+
+def _state_of(snapshot: Snapshot, name: str) -> State:
+    prefix = f"{name}."
+    tensors = {k.removeprefix(prefix): v for k, v in snapshot.tensors.items() if k.startswith(prefix)}
+    return State(snapshot.extra[name], tensors)
+
+
+class _Clock:
+    """Adds the time that passes to a run's progress."""
+
+    def __init__(self, progress: Progress, source: Source[Any]) -> None:
+        self._progress, self._source = progress, source
+        self._wall, self._cpu = time.monotonic(), self._used()
+
+    def _used(self) -> float:
+        usage = resource.getrusage(resource.RUSAGE_SELF)
+        return usage.ru_utime + usage.ru_stime + self._source.worker_cpu_seconds()
+
+    def tick(self) -> None:
+        """Count the time since the last tick."""
+        wall, cpu = time.monotonic(), self._used()
+        self._progress.seconds += wall - self._wall
+        self._progress.cpu_seconds += cpu - self._cpu
+        self._wall, self._cpu = wall, cpu
+
+    def skip(self) -> None:
+        """Leave out the time since the last tick: an evaluation is no training."""
+        self._wall, self._cpu = time.monotonic(), self._used()
+
+
+class _Meter:
+    """Means of what updates return."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, float] = {}
+        self._counts: dict[str, int] = {}
+
+    def add(self, values: Scalars) -> None:
+        """Add the numbers of one update; those that are not finite are left out."""
+        for name, value in values.items():
+            number = float(value)
+            if math.isfinite(number):
+                self._sums[name] = self._sums.get(name, 0.0) + number
+                self._counts[name] = self._counts.get(name, 0) + 1
+
+    def take(self) -> dict[str, float]:
+        """Return the means since the last call."""
+        means = {name: total / self._counts[name] for name, total in self._sums.items()}
+        self._sums.clear()
+        self._counts.clear()
+        return means

@@ -1,0 +1,85 @@
+"""What ends a training run, or a step of it: signals, time, numbers that are not finite."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+
+class NaNGuard:
+    """Keep non-finite updates away from the weights; give up when they do not stop."""
+
+    def __init__(self, patience: int = 20) -> None:
+        """Tolerate at most `patience` non-finite steps in a row."""
+        self.patience = patience
+        self.skipped = 0
+        """Steps refused so far."""
+        self._in_a_row = 0
+
+    def accept(self, *values: Tensor | float) -> bool:
+        """Return whether all values (losses, gradient norm) are finite; if not, the step must be skipped.
+
+        Raises:
+            FloatingPointError: After `patience` refusals in a row.
+        """
+        finite = all(
+            bool(torch.isfinite(v).all()) if isinstance(v, Tensor) else math.isfinite(v) for v in values
+        )
+        self._in_a_row = 0 if finite else self._in_a_row + 1
+        self.skipped += not finite
+        if self._in_a_row > self.patience:
+            raise FloatingPointError(f"training diverged: {self._in_a_row} non-finite steps in a row")
+        return finite
+
+
+class StopSignal:
+    """Context in which SIGINT and SIGTERM ask the loop to end instead of killing it."""
+
+    _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        self.requested = False
+        """Whether a signal came; a second SIGINT interrupts at once."""
+        self._previous: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Self:
+        """Install the handlers."""
+        self._previous = {s: signal.signal(s, self._handle) for s in self._SIGNALS}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Put the former handlers back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+class TimeLimit:
+    """Wall-clock limit of one bit of a run."""
+
+    def __init__(self, seconds: float | None) -> None:
+        """Count from now; None never ends."""
+        self._seconds = math.inf if seconds is None else seconds
+        self._start = time.monotonic()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the limit was made."""
+        return time.monotonic() - self._start
+
+    @property
+    def reached(self) -> bool:
+        """Whether the time is up."""
+        return self.elapsed >= self._seconds

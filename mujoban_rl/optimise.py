@@ -1,0 +1,78 @@
+"""Gradient steps as every learner takes them: clipped, scheduled, averaged, and refused when not finite."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from mujoban_rl.limits import NaNGuard
+
+
+def guarded_step(
+    loss: Tensor,
+    optimisers: Sequence[Optimizer],
+    guard: NaNGuard,
+    *,
+    clip: float = math.inf,
+    clipped: Iterable[nn.Parameter] | None = None,
+) -> Tensor | None:
+    """Step all optimisers along the gradient of a loss, or none of them if a number is not finite.
+
+    Args:
+        loss: Scalar.
+        optimisers: Every optimiser with a parameter in the loss, those of dual variables too.
+        guard: Decides.
+        clip: Largest norm of the gradient of `clipped`.
+        clipped: Parameters that are clipped together; those of the first optimiser by default.
+
+    Returns:
+        The gradient's norm before clipping, or None where the step was refused.
+    """
+    for optimiser in optimisers:
+        optimiser.zero_grad(set_to_none=True)
+    if not guard.accept(loss.detach()):
+        return None
+    loss.backward()
+    parameters = [p for o in optimisers for group in o.param_groups for p in group["params"] if p.grad is not None]
+    first = [p for group in optimisers[0].param_groups for p in group["params"]]
+    norm = nn.utils.clip_grad_norm_(list(clipped) if clipped is not None else first, clip)
+    if not guard.accept(norm, *(p.grad for p in parameters if p.grad is not None)):
+        return None
+    for optimiser in optimisers:
+        optimiser.step()
+    return norm
+
+
+class ProgressSchedule:
+    """Learning rates as a function of the share of the budget that is spent."""
+
+    def __init__(self, optimiser: Optimizer, factor: Callable[[float], float]) -> None:
+        """Scale the optimiser's present rates by `factor(progress)`."""
+        self._progress = 0.0
+        self._scheduler = LambdaLR(optimiser, lambda _: factor(self._progress))
+
+    def follow(self, progress: float) -> None:
+        """Set the rates for the next step; call it after a step, with the share in [0, 1] that is spent."""
+        self._progress = min(max(progress, 0.0), 1.0)
+        self._scheduler.step()
+
+
+def warm_up_cosine(warm_up: float) -> Callable[[float], float]:
+    """Return a schedule that rises over a share `warm_up` of the budget and falls to 0 along a half cosine."""
+
+    def factor(progress: float) -> float:
+        rise = min(1.0, progress / warm_up) if warm_up > 0 else 1.0
+        return rise * 0.5 * (1.0 + math.cos(math.pi * progress))
+
+    return factor
+
+
+def moving_average(module: nn.Module, decay: float) -> AveragedModel:
+    """Return an exponential moving average of a module's weights; `update_parameters` after every step."""
+    average = AveragedModel(module, multi_avg_fn=get_ema_multi_avg_fn(decay), use_buffers=False)
+    return average.eval()

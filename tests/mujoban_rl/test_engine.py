@@ -1,0 +1,152 @@
+import json
+import math
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from mujoban_rl.engine import Budget, Cadence, Learner, Source, State, Trainer
+from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
+from mujoban_rl.run_directory import RunDirectory
+
+CADENCE = Cadence(log_updates=2, evaluate_samples=40, save_seconds=math.inf)
+
+
+class Regression(Learner[torch.Tensor]):
+    """Learns to predict the first column from the others; its own randomness drops inputs."""
+
+    def __init__(self):
+        torch.manual_seed(0)
+        self.net = nn.Linear(3, 1)
+        self.duals = nn.Linear(1, 1, bias=False)
+        self.adam = torch.optim.Adam(self.net.parameters(), 1e-2)
+        self.dual_adam = torch.optim.Adam(self.duals.parameters(), 1e-2)
+        self.schedule = ProgressSchedule(self.adam, warm_up_cosine(0.1))
+        self.average = moving_average(self.net, 0.9)
+        self.generator = torch.Generator().manual_seed(1)
+
+    @property
+    def modules(self):
+        return {"net": self.net, "duals": self.duals, "average": self.average}
+
+    @property
+    def optimisers(self):
+        return {"adam": self.adam, "duals": self.dual_adam}
+
+    def state(self):
+        return State(tensors={"generator": self.generator.get_state()})
+
+    def restore(self, state):
+        self.generator.set_state(state.tensors["generator"])
+
+    def update(self, batch, progress, guard):
+        kept = torch.rand(batch[:, 1:].shape, generator=self.generator) < 0.9
+        loss = (self.duals(self.net(batch[:, 1:] * kept)) - batch[:, :1]).square().mean()
+        if guarded_step(loss, [self.adam, self.dual_adam], guard, clip=1.0) is not None:
+            self.average.update_parameters(self.net)
+        self.schedule.follow(progress)
+        return {"loss": loss.item()}
+
+    def evaluate(self):
+        return {"weight": float(self.net.weight.detach().abs().sum())}
+
+
+class Noise(Source[torch.Tensor]):
+    def __init__(self, poison=(), on_batch=None, end=None):
+        self.rng = np.random.default_rng(7)
+        self.poison, self.on_batch, self.end = poison, on_batch, end
+        self.batches, self.published, self.closed = 0, [], False
+
+    def next_batch(self):
+        if self.batches == self.end:
+            return None
+        self.batches += 1
+        self.samples += 4
+        if self.on_batch:
+            self.on_batch(self.batches)
+        batch = torch.from_numpy(self.rng.normal(size=(4, 4)).astype(np.float32))
+        return batch * math.nan if self.batches in self.poison else batch
+
+    def publish(self, weights, version):
+        self.published.append(version)
+
+    def state(self):
+        return State({"rng": self.rng.bit_generator.state, "batches": self.batches})
+
+    def restore(self, state):
+        self.rng.bit_generator.state = state.values["rng"]
+        self.batches = state.values["batches"]
+
+    def close(self):
+        self.closed = True
+
+
+def trainer(path, source=None, samples=200, cadence=CADENCE):
+    return Trainer(RunDirectory(path, {}), Regression(), source or Noise(), Budget(samples=samples), cadence)
+
+
+def weights(run):
+    return {
+        f"{name}.{k}": v.clone() for name, module in run.learner.modules.items() for k, v in module.state_dict().items()
+    }
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_a_run_interrupted_by_a_signal_and_resumed_equals_one_that_never_stopped(tmp_path):
+    whole = trainer(tmp_path / "whole")
+    assert whole.run()
+    kill = Noise(on_batch=lambda n: os.kill(os.getpid(), signal.SIGTERM) if n == 17 else None)
+    first = trainer(tmp_path / "parts", kill)
+    assert not first.run() and first.progress.updates == 17 and kill.closed
+    second = trainer(tmp_path / "parts")
+    assert second.progress.updates == 17 and second.run()
+    assert same(weights(whole), weights(second))
+    assert whole.metrics == second.metrics
+
+
+def test_a_batch_that_is_not_finite_changes_no_weight_and_no_optimiser(tmp_path):
+    run = trainer(tmp_path, Noise(poison={3}, end=2))
+    run.run()
+    before = weights(run)
+    moments = {k: v.clone() for k, v in run.learner.adam.state_dict()["state"][0].items()}
+    again = trainer(tmp_path, Noise(poison={3}, end=3))
+    again.run()
+    assert same(before, weights(again))
+    after = again.learner.adam.state_dict()["state"][0]
+    assert all(torch.equal(after[k], v) for k, v in moments.items())
+    assert again.progress.updates == 3
+
+
+def test_learning_curve_evaluations_and_published_versions_follow_the_cadence(tmp_path):
+    source = Noise()
+    trainer(tmp_path, source, samples=80, cadence=Cadence(log_updates=5, publish_updates=4, evaluate_samples=40)).run()
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines if "loss" in line] == [20, 40, 60, 80]
+    assert [line["step"] for line in lines if "evaluation/weight" in line] == [40, 80, 80]
+    assert source.published == [0, 4, 8, 12, 16, 20]
+    assert all("cpu_seconds" in line for line in lines)
+
+
+def test_schedules_follow_the_budget_and_a_spent_budget_trains_no_more(tmp_path):
+    run = trainer(tmp_path, samples=80)
+    run.run()
+    assert run.learner.adam.param_groups[0]["lr"] == pytest.approx(1e-2 * warm_up_cosine(0.1)(0.95))
+    before = weights(run)
+    again = trainer(tmp_path, samples=80)
+    assert again.run() and same(before, weights(again))
+
+
+def test_a_source_without_more_ends_the_run(tmp_path):
+    run = trainer(tmp_path, Noise(end=5))
+    assert run.run() and run.progress.updates == 5
+
+
+def test_a_budget_that_is_no_amount_is_refused():
+    with pytest.raises(ValueError, match="0 samples: expected a positive number"):
+        Budget(samples=0)
