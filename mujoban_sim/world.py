@@ -7,7 +7,7 @@ All positions are metres in the frame ``map``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import mujoco
 import numpy as np
@@ -20,7 +20,7 @@ from mujoban_core.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET,
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
 from mujoban_sim.scene import BOX_COORDINATES, SUBSTEPS, SceneCache, settled_positions
-from mujoban_sim.world_kernels import apply_torque, update
+from mujoban_sim.world_kernels import KernelState, apply_torque, pack, update
 from mujoban_sokoban.episodes import EpisodeSpec
 
 if TYPE_CHECKING:
@@ -153,20 +153,18 @@ class World:
         self._sensors = self._physics.bind("sensordata")
         self._root = BOX_COORDINATES * self.max_boxes
         self._rest_qpos = settled_positions(empty, self.max_boxes, self.body)
-        self._derived = self._kernel_arguments()
-
-    def _kernel_arguments(self) -> tuple[Any, ...]:
-        """Return what `update` takes after its rows; gathered once, since that would take as long as the kernel."""
-        goals, body = self.goals, self.body
-        return (
-            self._qpos, self._qvel, self._sensors, self._root, body.root == "free",
-            np.array(body.joint_qpos, np.int64), np.array(body.joint_qvel, np.int64), body.cell_size, self.time_limit,
-            self.box_count, self.target, goals.kind, goals.robot_target, goals.box_index, goals.box_target,
-            goals.tolerance, goals.max_box_speed, goals.reached, self.pose, self.velocity, self.proprio,
-            self.box_position, self.box_speed, self.agent_cell, self.box_cell, self.box_on_target,
-            self.boxes_on_target, self._abstract_state, self.reward, self.episode_return, self.steps, self.solved,
-            self.truncated,
-        )  # fmt: skip
+        body, goals = self.body, self.goals
+        self._kernel_state = pack(KernelState(
+            qpos=self._qpos, qvel=self._qvel, sensors=self._sensors, root=self._root, free_root=body.root == "free",
+            joint_qpos=np.array(body.joint_qpos, np.int64), joint_qvel=np.array(body.joint_qvel, np.int64),
+            cell_size=body.cell_size, time_limit=self.time_limit, box_count=self.box_count, target=self.target,
+            kind=goals.kind, robot_target=goals.robot_target, box_index=goals.box_index, box_target=goals.box_target,
+            tolerance=goals.tolerance, max_box_speed=goals.max_box_speed, reached=goals.reached, pose=self.pose,
+            velocity=self.velocity, proprio=self.proprio, box_position=self.box_position, box_speed=self.box_speed,
+            agent_cell=self.agent_cell, box_cell=self.box_cell, box_on_target=self.box_on_target,
+            boxes_on_target=self.boxes_on_target, abstract_state=self._abstract_state, reward=self.reward,
+            episode_return=self.episode_return, steps=self.steps, solved=self.solved, truncated=self.truncated,
+        ))  # fmt: skip
 
     @property
     def completed(self) -> NDArray[np.bool_]:
@@ -269,7 +267,7 @@ class World:
             q[:root].reshape(-1, BOX_COORDINATES)[:count, :2] = boxes[m, :count]
             body.set_pose(q[root:], pose[m])
         self._physics.forward(ids=rows)
-        update(rows, False, *self._derived)
+        update(rows, False, self._kernel_state)
 
     def instruct(self, instruction: NDArray[np.int64], issued: NDArray[np.bool_]) -> None:
         """Tell which instructions A_t the coming steps follow.
@@ -308,7 +306,7 @@ class World:
         else:
             self.reward[:] = 0.0
             self._physics.step(ids=live, nstep=SUBSTEPS, stage=_STAGE_VELOCITY)
-        if update(live, True, *self._derived):
+        if update(live, True, self._kernel_state):
             self._live = np.flatnonzero(~self.done)
 
     def abstract_state(self) -> NDArray[np.float32]:

@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.core import types
+from numba.experimental import structref
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import INERTIAL_SIZE, UP_AXIS_SIZE
@@ -18,6 +20,69 @@ from mujoban_sim.scene import BOX_COORDINATES
 from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD
 
 _HALF: Final = (GRID_SIZE - 1) / 2
+
+
+class KernelState(NamedTuple):
+    """What `update` reads and, from `reached` on, writes; `World` and its `GoalTracker` document most of it."""
+
+    qpos: NDArray[np.float64]
+    """Generalised positions in the layout of `mujoban_sim.scene`, [B, nq]."""
+    qvel: NDArray[np.float64]
+    """Generalised velocities, [B, nv]."""
+    sensors: NDArray[np.float64]
+    """Inertial sensors in the order of proprioception, [B, 9]."""
+    root: int
+    """Offset of the robot's coordinates in `qpos` and in `qvel`."""
+    free_root: bool
+    """Whether the robot's root is a free joint, see `mujoban_core.bodies`."""
+    joint_qpos: NDArray[np.int64]
+    """Offsets of the proprioceptive joints among the robot's positions, [J]."""
+    joint_qvel: NDArray[np.int64]
+    """The same among its velocities, [J]."""
+    cell_size: float
+    time_limit: int
+    box_count: NDArray[np.int64]
+    target: NDArray[np.bool_]
+    kind: NDArray[np.int64]
+    robot_target: NDArray[np.float64]
+    box_index: NDArray[np.int64]
+    box_target: NDArray[np.float64]
+    tolerance: float
+    max_box_speed: float
+    reached: NDArray[np.bool_]
+    pose: NDArray[np.float32]
+    velocity: NDArray[np.float32]
+    proprio: NDArray[np.float32]
+    box_position: NDArray[np.float32]
+    box_speed: NDArray[np.float32]
+    agent_cell: NDArray[np.int64]
+    box_cell: NDArray[np.int64]
+    box_on_target: NDArray[np.bool_]
+    boxes_on_target: NDArray[np.int64]
+    abstract_state: NDArray[np.float32]
+    reward: NDArray[np.float32]
+    episode_return: NDArray[np.float32]
+    steps: NDArray[np.int64]
+    solved: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+
+
+@structref.register
+class _StateType(types.StructRef):
+    """Numba's type of a packed `KernelState`."""
+
+
+class _PackedState(structref.StructRefProxy):
+    """A packed `KernelState`."""
+
+
+structref.define_proxy(_PackedState, _StateType, KernelState._fields)
+
+
+@njit(cache=True)
+def pack(state: KernelState) -> KernelState:
+    """Return a state as `update` takes it: by reference, since passing its fields would take as long as the work."""
+    return _PackedState(*state)  # pyright: ignore[reportReturnType] - it has the same fields
 
 
 @njit(cache=True, nogil=True)
@@ -105,7 +170,7 @@ def _observe_boxes(
 def _locate_agent(
     x: float, y: float, cell_size: float, box_cell: NDArray[np.int64], agent_cell: NDArray[np.int64]
 ) -> None:
-    """Update the agent's cell [2]; one that rounds into a box's cell keeps its last cell (DESIGN, section 3)."""
+    """Update the agent's cell [2]; one that rounds into a box's cell keeps its last cell."""
     row, col = _cell(x, y, cell_size)
     for k in range(box_cell.shape[0]):
         if box_cell[k, 0] == row and box_cell[k, 1] == col:
@@ -125,77 +190,42 @@ def _mark(
 
 
 @njit(cache=True, nogil=True)
-def update(
-    rows: NDArray[np.int64],
-    advance: bool,
-    qpos: NDArray[np.float64],
-    qvel: NDArray[np.float64],
-    sensors: NDArray[np.float64],
-    root: int,
-    free_root: bool,
-    joint_qpos: NDArray[np.int64],
-    joint_qvel: NDArray[np.int64],
-    cell_size: float,
-    time_limit: int,
-    box_count: NDArray[np.int64],
-    target: NDArray[np.bool_],
-    kind: NDArray[np.int64],
-    robot_target: NDArray[np.float64],
-    box_index: NDArray[np.int64],
-    box_target: NDArray[np.float64],
-    tolerance: float,
-    max_box_speed: float,
-    completed: NDArray[np.bool_],
-    pose: NDArray[np.float32],
-    velocity: NDArray[np.float32],
-    proprio: NDArray[np.float32],
-    box_position: NDArray[np.float32],
-    box_speed: NDArray[np.float32],
-    agent_cell: NDArray[np.int64],
-    box_cell: NDArray[np.int64],
-    box_on_target: NDArray[np.bool_],
-    boxes_on_target: NDArray[np.int64],
-    abstract_state: NDArray[np.float32],
-    reward: NDArray[np.float32],
-    episode_return: NDArray[np.float32],
-    steps: NDArray[np.int64],
-    solved: NDArray[np.bool_],
-    truncated: NDArray[np.bool_],
-) -> bool:
+def update(rows: NDArray[np.int64], advance: bool, state: KernelState) -> bool:
     """Derive everything that `World` shows of the given rows, [M], from physics; return whether an episode ended.
 
-    `advance` says whether to count a step and give rewards, as after physics has advanced. The robot's positions
-    start at `root` in `qpos` [B, nq], its velocities at the same offset in `qvel` [B, nv]; `joint_qpos` and
-    `joint_qvel`, [J], are the offsets of the proprioceptive joints. `sensors` is [B, 9]. All that follows
-    `time_limit` is as in `World` and its `GoalTracker`; from `completed` on it is written.
+    `advance` says whether to count a step and give rewards, as after physics has advanced. The state is packed.
     """
-    ended = False
+    ended, root, cell_size = False, state.root, state.cell_size
     for b in rows:
+        qpos, qvel = state.qpos[b], state.qvel[b]
         _observe_robot(
-            qpos[b, root:], qvel[b, root:], sensors[b], free_root, joint_qpos, joint_qvel,
-            pose[b], velocity[b], proprio[b],
+            qpos[root:], qvel[root:], state.sensors[b], state.free_root, state.joint_qpos, state.joint_qvel,
+            state.pose[b], state.velocity[b], state.proprio[b],
         )  # fmt: skip
-        _mark(abstract_state[b], agent_cell[b], box_cell[b], 0.0)
-        before = boxes_on_target[b]
-        boxes_on_target[b] = _observe_boxes(
-            qpos[b], qvel[b], cell_size, int(box_count[b]), target[b],
-            box_position[b], box_speed[b], box_cell[b], box_on_target[b],
+        _mark(state.abstract_state[b], state.agent_cell[b], state.box_cell[b], 0.0)
+        before = state.boxes_on_target[b]
+        state.boxes_on_target[b] = _observe_boxes(
+            qpos, qvel, cell_size, int(state.box_count[b]), state.target[b],
+            state.box_position[b], state.box_speed[b], state.box_cell[b], state.box_on_target[b],
         )  # fmt: skip
-        _locate_agent(qpos[b, root], qpos[b, root + 1], cell_size, box_cell[b], agent_cell[b])
-        _mark(abstract_state[b], agent_cell[b], box_cell[b], 1.0)
-        k = BOX_COORDINATES * box_index[b]
-        robot_offset = (qpos[b, root] - robot_target[b, 0], qpos[b, root + 1] - robot_target[b, 1])
-        box_offset = (qpos[b, k] - box_target[b, 0], qpos[b, k + 1] - box_target[b, 1])
-        speed = float(np.hypot(qvel[b, k], qvel[b, k + 1]))
-        completed[b] = is_completed(int(kind[b]), robot_offset, box_offset, speed, tolerance, max_box_speed)
+        _locate_agent(qpos[root], qpos[root + 1], cell_size, state.box_cell[b], state.agent_cell[b])
+        _mark(state.abstract_state[b], state.agent_cell[b], state.box_cell[b], 1.0)
+        k = BOX_COORDINATES * state.box_index[b]
+        robot_offset = (qpos[root] - state.robot_target[b, 0], qpos[root + 1] - state.robot_target[b, 1])
+        box_offset = (qpos[k] - state.box_target[b, 0], qpos[k + 1] - state.box_target[b, 1])
+        speed = float(np.hypot(qvel[k], qvel[k + 1]))
+        state.reached[b] = is_completed(
+            int(state.kind[b]), robot_offset, box_offset, speed, state.tolerance, state.max_box_speed
+        )
         if not advance:
             continue
-        steps[b] += 1
-        solved[b] = boxes_on_target[b] == box_count[b]
-        truncated[b] = steps[b] >= time_limit and not solved[b]
-        reward[b] = (boxes_on_target[b] - before) * BOX_REWARD + (SOLVED_REWARD if solved[b] else 0.0)
-        episode_return[b] += reward[b]
-        ended |= bool(solved[b] or truncated[b])
+        state.steps[b] += 1
+        state.solved[b] = state.boxes_on_target[b] == state.box_count[b]
+        state.truncated[b] = state.steps[b] >= state.time_limit and not state.solved[b]
+        placed = state.boxes_on_target[b] - before
+        state.reward[b] = placed * BOX_REWARD + (SOLVED_REWARD if state.solved[b] else 0.0)
+        state.episode_return[b] += state.reward[b]
+        ended |= bool(state.solved[b] or state.truncated[b])
     return ended
 
 
