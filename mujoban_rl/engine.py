@@ -16,8 +16,6 @@ a CPU, if learner and source keep everything that changes in `modules`, `optimis
 from __future__ import annotations
 
 import math
-import resource
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -27,6 +25,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
+from mujoban_rl.progress import Budget, Clock, Meter, Progress
 from mujoban_rl.run_directory import RunDirectory, Snapshot
 from mujoban_rl.training_log import TrainingLog
 
@@ -119,46 +118,16 @@ class Source(_Part, Generic[BatchT]):
 
 
 @dataclass(frozen=True)
-class Budget:
-    """What a run may spend; schedules follow whichever share is spent most. All bits of the run count together."""
-
-    samples: float = math.inf
-    updates: float = math.inf
-    seconds: float = math.inf
-    """Wall-clock seconds of training; makes schedules, and so the run, depend on the machine."""
-
-    def __post_init__(self) -> None:
-        """Reject budgets that are no amounts."""
-        for name in ("samples", "updates", "seconds"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"budget of {getattr(self, name)} {name}: expected a positive number")
-
-
-@dataclass(frozen=True)
 class Cadence:
     """How often a run logs, publishes, evaluates and saves."""
 
     log_updates: int = 100
     publish_updates: int = 10
     evaluate_samples: float = math.inf
-    """Samples between evaluations; the end of the budget is always evaluated."""
+    """Samples between evaluations; the end of a bit of the run is evaluated too, unless a signal asks to stop."""
+    evaluate_seconds: float = math.inf
+    """Wall-clock seconds between evaluations."""
     save_seconds: float = 120.0
-
-
-@dataclass
-class Progress:
-    """What a run has spent so far, in all its bits together."""
-
-    updates: int = 0
-    samples: int = 0
-    seconds: float = 0.0
-    """Wall-clock."""
-    cpu_seconds: float = 0.0
-    """Of all processes of the run."""
-
-    def share(self, budget: Budget) -> float:
-        """Return the share of the budget that is spent."""
-        return max(self.samples / budget.samples, self.updates / budget.updates, self.seconds / budget.seconds)
 
 
 class Trainer(Generic[BatchT]):
@@ -194,6 +163,8 @@ class Trainer(Generic[BatchT]):
         """Of the last evaluation."""
         self._record = dict(record or {})
         self._guard = NaNGuard()
+        self._published: dict[str, Tensor] | None = None
+        self._version = 0
         self._restore()
 
     @property
@@ -201,36 +172,48 @@ class Trainer(Generic[BatchT]):
         """Whether the budget is spent."""
         return self.progress.share(self.budget) >= 1.0
 
-    def run(self, *, limit_seconds: float | None = None) -> bool:
-        """Train until the budget or `limit_seconds` is spent, the source has no more, or a signal comes; then save.
+    def run(
+        self,
+        *,
+        limit_seconds: float | None = None,
+        limit_samples: float = math.inf,
+        limit_updates: float = math.inf,
+    ) -> bool:
+        """Train until the budget or a limit is spent, the source has no more, or a signal comes; then save.
+
+        Args:
+            limit_seconds: Wall-clock seconds of this bit of the run.
+            limit_samples: Samples of the whole run after which this bit ends; schedules follow the budget.
+            limit_updates: Updates of the whole run after which this bit ends.
 
         Returns:
             Whether the run is complete.
         """
-        samples = self.budget.samples
+        samples = min(self.budget.samples, limit_samples)
         total = None if math.isinf(samples) else int(samples)
+        limits = _Limits(TimeLimit(limit_seconds), limit_samples, limit_updates)
         try:
             with (
                 TrainingLog(self.directory, total=total, initial=self.progress.samples, unit="sample") as log,
                 StopSignal() as stop,
             ):
-                spent = self._loop(log, stop, TimeLimit(limit_seconds))
-                if spent:
+                spent = self._loop(log, stop, limits)
+                if not stop.requested:
                     self._evaluate(log)
                 self.save()
         finally:
             self.source.close()
         return spent
 
-    def _loop(self, log: TrainingLog, stop: StopSignal, limit: TimeLimit) -> bool:
+    def _loop(self, log: TrainingLog, stop: StopSignal, limits: _Limits) -> bool:
         """Train; return whether it ended because nothing is left to do."""
         cadence, progress, source = self.cadence, self.progress, self.source
-        clock, meter = _Clock(progress, source), _Meter()
-        saved = limit.elapsed
+        clock, meter = Clock(progress, source.worker_cpu_seconds), Meter()
+        saved = evaluated = limits.time.elapsed
         if not self.complete:
-            source.publish(self.learner.weights(), progress.updates)
+            self._publish(again=True)
         while not self.complete:
-            if stop.requested or limit.reached:
+            if stop.requested or limits.reached(progress):
                 return False
             batch = source.next_batch()
             if batch is None:
@@ -241,19 +224,29 @@ class Trainer(Generic[BatchT]):
             clock.tick()
             log.advance(progress.samples - before)
             if progress.updates % cadence.publish_updates == 0:
-                source.publish(self.learner.weights(), progress.updates)
+                self._publish()
             if progress.updates % cadence.log_updates == 0:
                 log.scalars(progress.samples, {**meter.take(), **source.statistics(), **self._spent()})
-            if progress.samples // cadence.evaluate_samples > before // cadence.evaluate_samples:
+            due = progress.samples // cadence.evaluate_samples > before // cadence.evaluate_samples
+            if due or limits.time.elapsed - evaluated > cadence.evaluate_seconds:
                 self._evaluate(log)
                 clock.skip()
-            if limit.elapsed - saved > cadence.save_seconds:
-                saved = limit.elapsed
+                evaluated = limits.time.elapsed
+            if limits.time.elapsed - saved > cadence.save_seconds:
+                saved = limits.time.elapsed
                 self.save()
         return True
 
+    def _publish(self, *, again: bool = False) -> None:
+        """Hand the newest weights to the source, or `again` those that it had when the run stopped."""
+        if self._published is None or not again:
+            self._published = {k: v.detach().clone() for k, v in self.learner.weights().items()}
+            self._version = self.progress.updates
+        self.source.publish(self._published, self._version)
+
     def _evaluate(self, log: TrainingLog) -> None:
-        self.metrics = dict(self.learner.evaluate())
+        # A rate of nothing is not a number, which JSON does not know.
+        self.metrics = {k: float(v) for k, v in self.learner.evaluate().items() if math.isfinite(v)}
         if not self.metrics:
             return
         log.scalars(self.progress.samples, {f"evaluation/{k}": v for k, v in self.metrics.items()} | self._spent())
@@ -273,6 +266,7 @@ class Trainer(Generic[BatchT]):
         """Write a checkpoint, and export the weights with their record."""
         parts = {"learner": self.learner, "source": self.source}
         states = {name: part.state() for name, part in parts.items()}
+        states["published"] = State({"version": self._version}, self._published or {})
         self.directory.save(
             self.progress.updates,
             modules={f"{name}.{k}": v for name, part in parts.items() for k, v in part.modules.items()},
@@ -301,56 +295,25 @@ class Trainer(Generic[BatchT]):
         self._guard.skipped = snapshot.extra["skipped"]
         for name, part in parts.items():
             part.restore(_state_of(snapshot, name))
+        published = _state_of(snapshot, "published")
+        self._published, self._version = published.tensors, published.values["version"]
         self.source.samples = self.progress.samples
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """What ends one bit of a run."""
+
+    time: TimeLimit
+    samples: float
+    updates: float
+
+    def reached(self, progress: Progress) -> bool:
+        """Return whether one of the limits is reached."""
+        return self.time.reached or progress.samples >= self.samples or progress.updates >= self.updates
 
 
 def _state_of(snapshot: Snapshot, name: str) -> State:
     prefix = f"{name}."
     tensors = {k.removeprefix(prefix): v for k, v in snapshot.tensors.items() if k.startswith(prefix)}
     return State(snapshot.extra[name], tensors)
-
-
-class _Clock:
-    """Adds the time that passes to a run's progress."""
-
-    def __init__(self, progress: Progress, source: Source[Any]) -> None:
-        self._progress, self._source = progress, source
-        self._wall, self._cpu = time.monotonic(), self._used()
-
-    def _used(self) -> float:
-        usage = resource.getrusage(resource.RUSAGE_SELF)
-        return usage.ru_utime + usage.ru_stime + self._source.worker_cpu_seconds()
-
-    def tick(self) -> None:
-        """Count the time since the last tick."""
-        wall, cpu = time.monotonic(), self._used()
-        self._progress.seconds += wall - self._wall
-        self._progress.cpu_seconds += cpu - self._cpu
-        self._wall, self._cpu = wall, cpu
-
-    def skip(self) -> None:
-        """Leave out the time since the last tick: an evaluation is no training."""
-        self._wall, self._cpu = time.monotonic(), self._used()
-
-
-class _Meter:
-    """Means of what updates return."""
-
-    def __init__(self) -> None:
-        self._sums: dict[str, float] = {}
-        self._counts: dict[str, int] = {}
-
-    def add(self, values: Scalars) -> None:
-        """Add the numbers of one update; those that are not finite are left out."""
-        for name, value in values.items():
-            number = float(value)
-            if math.isfinite(number):
-                self._sums[name] = self._sums.get(name, 0.0) + number
-                self._counts[name] = self._counts.get(name, 0) + 1
-
-    def take(self) -> dict[str, float]:
-        """Return the means since the last call."""
-        means = {name: total / self._counts[name] for name, total in self._sums.items()}
-        self._sums.clear()
-        self._counts.clear()
-        return means

@@ -12,6 +12,8 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from mujoban_rl.limits import NaNGuard
 
+Weights = tuple[Tensor, ...] | list[Tensor]
+
 
 def guarded_step(
     loss: Tensor,
@@ -35,17 +37,20 @@ def guarded_step(
     """
     for optimiser in optimisers:
         optimiser.zero_grad(set_to_none=True)
-    if not guard.accept(loss.detach()):
-        return None
     loss.backward()
-    parameters = [p for o in optimisers for group in o.param_groups for p in group["params"] if p.grad is not None]
-    first = [p for group in optimisers[0].param_groups for p in group["params"]]
-    norm = nn.utils.clip_grad_norm_(list(clipped) if clipped is not None else first, clip)
-    if not guard.accept(norm, *(p.grad for p in parameters if p.grad is not None)):
+    first = list(clipped) if clipped is not None else _parameters(optimisers[:1])
+    known = {id(p) for p in first}
+    others = [p.grad for p in _parameters(optimisers) if id(p) not in known and p.grad is not None]
+    norm = nn.utils.clip_grad_norm_(first, clip)
+    if not guard.accept(loss.detach(), norm, *others):
         return None
     for optimiser in optimisers:
         optimiser.step()
     return norm
+
+
+def _parameters(optimisers: Sequence[Optimizer]) -> list[nn.Parameter]:
+    return [p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]]
 
 
 class ProgressSchedule:
@@ -72,7 +77,18 @@ def warm_up_cosine(warm_up: float) -> Callable[[float], float]:
     return factor
 
 
-def moving_average(module: nn.Module, decay: float) -> AveragedModel:
-    """Return an exponential moving average of a module's weights; `update_parameters` after every step."""
-    average = AveragedModel(module, multi_avg_fn=get_ema_multi_avg_fn(decay), use_buffers=False)
-    return average.eval()
+def moving_average(module: nn.Module, decay: float, *, warm_up: bool = False) -> AveragedModel:
+    """Return an exponential moving average of a module's weights; `update_parameters` after every step.
+
+    Args:
+        module: Module to average.
+        decay: Share of the average that a step leaves.
+        warm_up: Let the decay of the n-th step be at most (1 + n) / (10 + n), so that early weights are soon forgotten.
+    """
+
+    def warming(average: Weights, current: Weights, steps: Tensor | int) -> None:
+        n = int(steps) + 1
+        get_ema_multi_avg_fn(min(decay, (1 + n) / (10 + n)))(average, current, steps)
+
+    averaging = warming if warm_up else get_ema_multi_avg_fn(decay)
+    return AveragedModel(module, multi_avg_fn=averaging, use_buffers=False).eval()

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, State, Trainer
+from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_rl.run_directory import RunDirectory
 
@@ -140,6 +141,53 @@ def test_schedules_follow_the_budget_and_a_spent_budget_trains_no_more(tmp_path)
     before = weights(run)
     again = trainer(tmp_path, samples=80)
     assert again.run() and same(before, weights(again))
+
+
+def test_after_a_stop_actors_go_on_with_the_weights_that_they_had(tmp_path):
+    class Acting(Noise):
+        def publish(self, weights, version):
+            self.bias = weights["bias"].clone()
+            super().publish(weights, version)
+
+        def next_batch(self):
+            batch = super().next_batch()
+            return None if batch is None else batch + self.bias
+
+    class Publishing(Regression):
+        def weights(self):
+            return self.net.state_dict()
+
+    def run(path, **limits):
+        made = Trainer(RunDirectory(path, {}), Publishing(), Acting(), Budget(updates=20), Cadence(publish_updates=6))
+        made.run(**limits)
+        return made
+
+    whole = run(tmp_path / "whole")
+    run(tmp_path / "parts", limit_updates=5)
+    run(tmp_path / "parts", limit_samples=36)
+    resumed = run(tmp_path / "parts")
+    assert same(weights(whole), weights(resumed))
+    assert resumed.source.published == [6, 12, 18]
+
+
+def test_gradients_that_stay_not_finite_end_the_run_though_losses_are_finite():
+    weight = torch.nn.Parameter(torch.zeros(1))
+    adam, guard = torch.optim.Adam([weight]), NaNGuard(patience=3)
+    with pytest.raises(FloatingPointError, match="4 non-finite steps in a row"):
+        for _ in range(4):
+            guarded_step(weight.sqrt().sum(), [adam], guard)
+    assert weight.item() == 0.0 and guard.skipped == 4
+
+
+def test_an_average_that_warms_up_forgets_early_weights_soon():
+    net = nn.Linear(1, 1)
+    averages = [moving_average(net, 0.999, warm_up=warm_up) for warm_up in (True, False)]
+    for step in range(30):
+        nn.init.constant_(net.weight, float(step))
+        for average in averages:
+            average.update_parameters(net)
+    warm, cold = (float(average.module.weight.detach()) for average in averages)
+    assert warm > 20.0 and cold < 1.0
 
 
 def test_a_source_without_more_ends_the_run(tmp_path):
