@@ -1,0 +1,1 @@
+"""Losses, each a class or function of tensors alone."""
