@@ -21,6 +21,13 @@ from mujoban_sokoban.episodes import EpisodeSpec
 Tree = TypeVar("Tree")
 
 
+class Ending(NamedTuple):
+    """What E rows of the world hold behind the last tick of their episodes."""
+
+    observation: Observation
+    truth: GroundTruth
+
+
 class Tick(NamedTuple):
     """One tick of the M rows in which an episode runs."""
 
@@ -40,6 +47,8 @@ class Tick(NamedTuple):
     solved: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     """Whether the episode's time ran out with this tick, [M]."""
+    ending: Ending | None = None
+    """What those rows hold now whose episodes ended with this tick, in their order; None if none did."""
 
 
 def select(tree: Tree, rows: NDArray[np.int64]) -> Tree:
@@ -80,12 +89,13 @@ def ticks(
         world.instruct(instruction, issued)
         world.step(torque)
         solved, truncated = world.solved[rows], world.truncated[rows]
+        ended = solved | truncated
         yield Tick(
             rows, episode, step, observation, truth, decision,
             world.reward[rows], world.episode_return[rows], solved, truncated,
+            _ending(world, rows[ended], camera=camera) if ended.any() else None,
         )
         step = step + 1
-        ended = solved | truncated
         if not ended.any():
             continue
         episode, finished = episode.copy(), np.zeros(len(rows), np.bool_)
@@ -104,6 +114,10 @@ def ticks(
             return
         if kept.size < len(rows):
             rows, episode, step, seeds, state = select((rows, episode, step, seeds, state), kept)
+
+
+def _ending(world: World, rows: NDArray[np.int64], *, camera: bool) -> Ending:
+    return Ending(observe(world, rows, camera=camera), select(world.truth(), rows))
 
 
 def rollout(

@@ -1,7 +1,7 @@
 """Write the ticks of a batched rollout as bags, one bag for each row of the world.
 
-The bags are those that `run_stack.py --record` writes: the same topics, types and stamps, with simulated time as log
-time. Only the view from above is left out unless it is asked for.
+The bags are those that `run_stack.py --record` writes: the same messages with the same stamps, and simulated time as
+log time. Only the view from above is left out.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+import numpy as np
 from rclpy.serialization import serialize_message
 
 from bringup.rollout import Tick
 from mujoban_core.bodies import Body
-from mujoban_core.camera import camera_intrinsics
-from mujoban_core.grid import BOX, TARGET
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.topics import TICK, Topic
+from mujoban_sim.tick_messages import EpisodeProgress, SimulatorTick, TickComposer, TickLabel
 from mujoban_sokoban.episodes import EpisodeSpec
 
 TOPICS: Final = tuple(t for t in (*topics.SIMULATOR_TOPICS, *topics.MODULE_TOPICS) if t is not topics.TOP_CAMERA)
@@ -32,6 +32,7 @@ class _Row:
     """What the messages of a row's next tick say about the past."""
 
     writer: BagWriter
+    composer: TickComposer
     stamp: int = 0
     episode: int = 0
     sequence: int = 0
@@ -64,8 +65,8 @@ class Recorder:
             episodes_per_file: Episodes in one file of a bag; None: all.
         """
         self._path, self._prefix, self._episodes_per_file = path, prefix, episodes_per_file
-        self._body, self._episodes, self._difficulties = body, episodes, difficulties
-        self._intrinsics = camera_intrinsics(body.camera)
+        self._episodes, self._difficulties = episodes, difficulties
+        self._body = body
         self._rows: dict[int, _Row] = {}
         self.ticks = 0
         """Ticks written."""
@@ -86,7 +87,8 @@ class Recorder:
         for m, number in enumerate(tick.rows.tolist()):
             if number not in self._rows:
                 path = self._path / f"{self._prefix}row{number:03d}"
-                self._rows[number] = _Row(BagWriter(path, TOPICS, episodes_per_file=self._episodes_per_file))
+                writer = BagWriter(path, TOPICS, episodes_per_file=self._episodes_per_file)
+                self._rows[number] = _Row(writer, TickComposer(self._body))
             self._write_row(self._rows[number], tick, m)
         self.ticks += len(tick.rows)
 
@@ -95,7 +97,8 @@ class Recorder:
             row.episode += 1
             row.sequence, row.reward, row.episode_return = 0, 0.0, 0.0
         row.stamp += TICK
-        self._put(row, self._observed(row, tick, m))
+        seen = SimulatorTick(self._label(row, tick, m), self._progress(row, tick, m), tick.observation, tick.truth, m)
+        self._observed(row, seen)
         self._put(row, _decided(row, tick, m))
         row.sequence = int(tick.decision.sequence[m])
         row.reward, row.episode_return = float(tick.reward[m]), float(tick.episode_return[m])
@@ -103,64 +106,32 @@ class Recorder:
             self._end(row, tick, m)
 
     def _end(self, row: _Row, tick: Tick, m: int) -> None:
-        """Write how the episode ended; what the robot saw then is not known any more, and needs no answer."""
+        """Write how the episode ended, which needs no answer."""
+        if tick.ending is None:
+            raise ValueError("an episode ends in a tick without an ending: expected what the robot perceives then")
         row.stamp += TICK
-        ended = self._episode(row, tick, m)._replace(
-            step=int(tick.step[m]) + 1,
-            solved=bool(tick.solved[m]),
-            terminated=bool(tick.solved[m]),
-            truncated=bool(tick.truncated[m]),
+        ended = np.flatnonzero(tick.solved | tick.truncated)
+        progress = self._progress(row, tick, m)._replace(
+            step=int(tick.step[m]) + 1, solved=bool(tick.solved[m]), truncated=bool(tick.truncated[m])
         )
-        header = conversions.header(row.stamp, topics.MAP_FRAME)
-        self._put(row, {
-            topics.CLOCK: conversions.clock_to_msg(row.stamp),
-            topics.EPISODE: conversions.episode_to_msg(header, ended),
-        })  # fmt: skip
+        index = int(np.searchsorted(ended, m))
+        self._observed(row, SimulatorTick(self._label(row, tick, m), progress, *tick.ending, index))
         row.writer.end_episode()
 
     def _put(self, row: _Row, messages: Mapping[Topic, Any]) -> None:
         for topic, message in messages.items():
             row.writer.write(topic.name, row.stamp, serialize_message(message))
 
-    def _episode(self, row: _Row, tick: Tick, m: int) -> conversions.EpisodeReading:
-        index = int(tick.episode[m])
-        spec = self._episodes[index]
-        state = tick.truth.abstract_state[m]
-        return conversions.EpisodeReading(
-            episode=row.episode,
-            seed=spec.seed,
-            difficulty=self._difficulties[index],
-            level=spec.level.to_text(),
-            step=int(tick.step[m]),
-            reward=row.reward,
-            episode_return=row.episode_return,
-            solved=False,
-            terminated=False,
-            truncated=False,
-            boxes_on_target=int((state[..., BOX] * state[..., TARGET]).sum()),
-        )
+    def _label(self, row: _Row, tick: Tick, m: int) -> TickLabel:
+        return TickLabel(row.stamp, row.episode, self._difficulties[int(tick.episode[m])], row.sequence)
 
-    def _observed(self, row: _Row, tick: Tick, m: int) -> dict[Topic, Any]:
-        """Return what the simulator says in a tick, in the order in which it says it."""
-        camera, body, field = (
-            conversions.header(row.stamp, frame) for frame in (topics.CAMERA_FRAME, topics.BODY_FRAME, topics.MAP_FRAME)
-        )
-        observation, truth = tick.observation, tick.truth
-        boxes = truth.box_position[m, : len(self._episodes[int(tick.episode[m])].level.boxes)]
-        completed = bool(truth.completed[m])
-        return {
-            topics.CLOCK: conversions.clock_to_msg(row.stamp),
-            topics.EPISODE: conversions.episode_to_msg(field, self._episode(row, tick, m)),
-            topics.CAMERA: conversions.frame_to_msg(camera, observation.frame[m]),
-            topics.CAMERA_INFO: conversions.camera_info_to_msg(camera, self._intrinsics),
-            topics.PROPRIO: conversions.proprio_to_msg(body, observation.proprio[m], self._body.joints),
-            topics.POSE: conversions.pose_to_msg(field, observation.pose[m]),
-            topics.TRUE_ABSTRACT_STATE: conversions.abstract_state_to_msg(field, truth.abstract_state[m]),
-            topics.TRUE_POSE: conversions.pose_to_msg(field, truth.pose[m]),
-            topics.TRUE_TWIST: conversions.twist_to_msg(field, truth.velocity[m]),
-            topics.TRUE_BOXES: conversions.boxes_to_msg(field, boxes),
-            topics.TRUE_TERMINATION: conversions.termination_to_msg(field, row.sequence, float(completed), completed),
-        }
+    def _progress(self, row: _Row, tick: Tick, m: int) -> EpisodeProgress:
+        spec = self._episodes[int(tick.episode[m])]
+        return EpisodeProgress(spec, int(tick.step[m]), row.reward, row.episode_return, solved=False, truncated=False)
+
+    def _observed(self, row: _Row, tick: SimulatorTick) -> None:
+        """Write what the simulator says in a tick."""
+        self._put(row, {topic: row.composer.compose(topic, tick) for topic in row.composer.topics})
 
 
 def _decided(row: _Row, tick: Tick, m: int) -> dict[Topic, Any]:

@@ -25,8 +25,9 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime.tick_node import LOG_PERIOD, live_qos, run_node
 from mujoban_msgs_py.topics import TICK
-from mujoban_sim.observation import ObservationPublisher, TickLabel
+from mujoban_sim.observation import ObservationPublisher
 from mujoban_sim.rendering import RenderingError
+from mujoban_sim.tick_messages import TickLabel
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 

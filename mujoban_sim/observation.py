@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
-from std_msgs.msg import Header
 
-from mujoban_core.camera import camera_intrinsics
+from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.topics import Topic
+from mujoban_sim.tick_messages import EpisodeProgress, SimulatorTick, TickComposer, TickLabel
 from mujoban_sim.world import World
-from mujoban_sokoban.episodes import EpisodeSpec
 
 _NEEDED = (topics.EPISODE, topics.CAMERA, topics.PROPRIO, topics.POSE)
 """What the modules cannot do without."""
 GLANCE = 4
 """Ticks between two views from above where all who read it ask for best effort, as those do who only watch."""
-
-
-class TickLabel(NamedTuple):
-    """What names a tick besides the state of the world."""
-
-    stamp: int
-    """Simulated time [ns]."""
-    episode: int
-    """Number of the episode, from 1."""
-    difficulty: int
-    sequence: int
-    """Number of the instruction in force before this tick, 0 for none."""
 
 
 class ObservationPublisher:
@@ -47,25 +33,8 @@ class ObservationPublisher:
         self._node = node
         self._world = world
         self._top_camera_size = top_camera_size
-        self._joints = list(world.body.joints)
-        self._spec: EpisodeSpec | None = None
-        self._level_text = ""
-        self._intrinsics = camera_intrinsics(world.body.camera)
+        self._composer = TickComposer(world.body)
         self._publishers = {t: node.create_publisher(t.type, t.name, t.qos) for t in topics.SIMULATOR_TOPICS}
-        self._composers: dict[Topic, Callable[[TickLabel], Any]] = {
-            topics.CLOCK: lambda label: conversions.clock_to_msg(label.stamp),
-            topics.EPISODE: self._episode,
-            topics.CAMERA: self._camera,
-            topics.CAMERA_INFO: self._camera_info,
-            topics.PROPRIO: self._proprio,
-            topics.POSE: self._pose,
-            topics.TRUE_POSE: self._pose,
-            topics.TRUE_ABSTRACT_STATE: self._abstract_state,
-            topics.TRUE_TWIST: self._twist,
-            topics.TRUE_BOXES: self._boxes,
-            topics.TRUE_TERMINATION: self._termination,
-            topics.TOP_CAMERA: self._top_camera,
-        }
         self._on_demand = {*topics.TRUTH_TOPICS, topics.TOP_CAMERA, topics.CAMERA_INFO}
         self._top_readers, self._top_period = 0, 1
 
@@ -76,9 +45,26 @@ class ObservationPublisher:
 
     def publish(self, label: TickLabel) -> None:
         """Publish the world as it is now."""
+        tick = self._tick(label)
         for topic, publisher in self._publishers.items():
-            if topic not in self._on_demand or self._is_wanted(topic, label.stamp):
-                publisher.publish(self._composers[topic](label))
+            if topic in self._on_demand and not self._is_wanted(topic, label.stamp):
+                continue
+            composed = self._top_camera(label) if topic is topics.TOP_CAMERA else self._composer.compose(topic, tick)
+            publisher.publish(composed)
+
+    def _tick(self, label: TickLabel) -> SimulatorTick:
+        world = self._world
+        (spec,) = world.episodes
+        if spec is None:
+            raise RuntimeError("no episode has been started")
+        progress = EpisodeProgress(
+            spec, int(world.steps[0]), world.reward[0], world.episode_return[0],
+            bool(world.solved[0]), bool(world.truncated[0]),
+        )  # fmt: skip
+        # Live arrays will do: the messages are composed before the world moves on.
+        observation = Observation(world.render(), world.proprio, world.pose)
+        truth = GroundTruth(world.abstract_state(), world.pose, world.velocity, world.box_position, world.completed)
+        return SimulatorTick(label, progress, observation, truth, 0)
 
     def _is_wanted(self, topic: Topic, stamp: int) -> bool:
         readers = self._publishers[topic].get_subscription_count()
@@ -92,59 +78,6 @@ class ObservationPublisher:
             self._top_period = GLANCE if glances and len(known) == readers else 1
         return stamp // topics.TICK % self._top_period == 0
 
-    def _episode(self, label: TickLabel) -> Any:
-        world = self._world
-        spec = world.episodes[0]
-        if spec is None:
-            raise RuntimeError("no episode has been started")
-        if spec is not self._spec:
-            self._spec, self._level_text = spec, spec.level.to_text()
-        reading = conversions.EpisodeReading(
-            episode=label.episode,
-            seed=spec.seed,
-            difficulty=label.difficulty,
-            level=self._level_text,
-            step=int(world.steps[0]),
-            reward=world.reward[0],
-            episode_return=world.episode_return[0],
-            solved=bool(world.solved[0]),
-            terminated=bool(world.solved[0]),
-            truncated=bool(world.truncated[0]),
-            boxes_on_target=int(world.box_on_target[0].sum()),
-        )
-        return conversions.episode_to_msg(conversions.header(label.stamp, topics.MAP_FRAME), reading)
-
-    def _camera(self, label: TickLabel) -> Any:
-        return conversions.frame_to_msg(conversions.header(label.stamp, topics.CAMERA_FRAME), self._world.render()[0])
-
-    def _camera_info(self, label: TickLabel) -> Any:
-        return conversions.camera_info_to_msg(conversions.header(label.stamp, topics.CAMERA_FRAME), self._intrinsics)
-
-    def _proprio(self, label: TickLabel) -> Any:
-        header = conversions.header(label.stamp, topics.BODY_FRAME)
-        return conversions.proprio_to_msg(header, self._world.proprio[0], self._joints)
-
-    def _pose(self, label: TickLabel) -> Any:
-        return conversions.pose_to_msg(_map_header(label), self._world.pose[0])
-
-    def _abstract_state(self, label: TickLabel) -> Any:
-        return conversions.abstract_state_to_msg(_map_header(label), self._world.abstract_state()[0])
-
-    def _twist(self, label: TickLabel) -> Any:
-        return conversions.twist_to_msg(_map_header(label), self._world.velocity[0])
-
-    def _boxes(self, label: TickLabel) -> Any:
-        present = self._world.box_position[0, : self._world.box_count[0]]
-        return conversions.boxes_to_msg(_map_header(label), present)
-
-    def _termination(self, label: TickLabel) -> Any:
-        completed = bool(self._world.completed[0])
-        return conversions.termination_to_msg(_map_header(label), label.sequence, float(completed), completed)
-
     def _top_camera(self, label: TickLabel) -> Any:
         frame = self._world.render("top_down", size=self._top_camera_size)[0]
         return conversions.frame_to_msg(conversions.header(label.stamp, topics.TOP_CAMERA_FRAME), frame)
-
-
-def _map_header(label: TickLabel) -> Header:
-    return conversions.header(label.stamp, topics.MAP_FRAME)

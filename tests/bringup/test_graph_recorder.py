@@ -7,12 +7,16 @@ from mujoban_msgs.msg import AbstractState
 from rclpy.serialization import deserialize_message
 
 from bringup.graph_recorder import RecorderNode
+from bringup.rollout import ticks
+from bringup.rollout_recorder import TOPICS as ROLLOUT_TOPICS
+from bringup.rollout_recorder import Recorder
 from bringup.stack import PlayOptions, play
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, open_bag
 from mujoban_msgs_py.conversions import stamp_of
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, SIMULATOR_TOPICS, TICK
+from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
 
@@ -45,6 +49,30 @@ def test_a_lockstep_bag_lacks_nothing(bags):
 
 def test_two_runs_give_the_same_bag(bags):
     assert contents(bags[0]) == contents(bags[1])
+
+
+def said(bag):
+    """Return what each topic of a rollout's bag said, by stamp."""
+    found = {topic.name: {} for topic in ROLLOUT_TOPICS}
+    for topic, stamp, data in contents(bag):
+        if topic in found:
+            found[topic][stamp] = deserialize_message(data, GRAPH_TOPICS[topic].type)
+    return found
+
+
+def test_the_graph_and_the_rollout_record_the_same_of_an_episode(oracles, tmp_path):
+    episodes = Episodes(2, 3, difficulty=1)
+    results = play(oracles, episodes, PlayOptions(record=tmp_path / "graph", time_limit=200)).results
+    assert results[0].solved
+    world = World(1, max_boxes=episodes.max_boxes, time_limit=200)
+    with Recorder(tmp_path, world.body, episodes, [1, 1]) as recorder:
+        for tick in ticks(oracles.policy(), world, episodes, camera=True):
+            recorder.write(tick)
+    graph, rollout = said(tmp_path / "graph"), said(tmp_path / "row000")
+    for topic in graph:
+        assert graph[topic] == rollout[topic], topic
+    last = [m for m in rollout[topics.EPISODE.name].values() if m.solved]
+    assert last[0].boxes_on_target == 1 and last[0].reward > 10
 
 
 def test_messages_carry_the_stamp_that_they_are_logged_with(bags):

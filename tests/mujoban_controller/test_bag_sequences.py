@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from bringup.rollout import Tick
+from bringup.rollout import Ending, Tick
 from bringup.rollout_recorder import Recorder
 from mujoban_controller.bag_sequences import BagSequences, episodes, open_checked, transitions
 from mujoban_controller.controller import Recurrent, VisuomotorController
@@ -51,6 +51,7 @@ def play_and_record(path, seed):
             })  # fmt: skip
             said = TerminationOutput(np.zeros(1, np.float32), inputs.terminated, np.array([failed]))
             pose = task.world.pose.copy()
+            result = task.step(torque)
             recorder.write(Tick(
                 np.array([0]), np.array([0]), np.array([step]), Observation(inputs.frame, inputs.proprio, pose),
                 inputs.truth, Decision(
@@ -58,8 +59,8 @@ def play_and_record(path, seed):
                     torque,
                 ),
                 np.zeros(1, np.float32), np.zeros(1, np.float32), never, np.array([step == LENGTH - 1]),
+                Ending(task.world.observation(), task.world.truth()) if step == LENGTH - 1 else None,
             ))  # fmt: skip
-            result = task.step(torque)
             live[-1] |= {"reward": result.reward[0], "discount": result.discount[0]}
     return {name: np.stack([tick[name] for tick in live])[:-1] for name in live[0]}
 

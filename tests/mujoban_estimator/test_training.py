@@ -8,7 +8,7 @@ import torch
 from bringup.command import Choice, Stack
 from bringup.exploration import Disturbance
 from bringup.record import Job, MixedEpisodes, record
-from bringup.rollout import Tick
+from bringup.rollout import Ending, Tick
 from bringup.rollout_recorder import TOPICS as RECORDED
 from bringup.rollout_recorder import Recorder
 from mujoban_core.bodies import BALL
@@ -43,18 +43,18 @@ def made_up_ticks(episodes, lengths=LENGTHS):
             pose = np.array([[0.01 * mark, 0.5, 0.1]], np.float32)
             boxes = np.zeros((1, 4, 2), np.float32)
             issued = np.array([step % 4 == 0])
+            frame = np.full((1, 64, 64, 3), mark, np.uint8)
+            observation = Observation(frame, np.full((1, BALL.proprio_size), mark, np.float32), pose)
+            truth = GroundTruth(state, pose, np.zeros((1, 3), np.float32), boxes, np.array([step % 4 == 3]))
             yield Tick(
-                np.array([0]), np.array([index]), np.array([step]),
-                Observation(
-                    np.full((1, 64, 64, 3), mark, np.uint8), np.full((1, BALL.proprio_size), mark, np.float32), pose
-                ),
-                GroundTruth(state, pose, np.zeros((1, 3), np.float32), boxes, np.array([step % 4 == 3])),
+                np.array([0]), np.array([index]), np.array([step]), observation, truth,
                 Decision(
                     state, TerminationOutput(np.array([0.25], np.float32), issued & (step > 0), np.array([False])),
                     np.array([1 + step // 4]), np.array([1 + step // 4]), issued, np.zeros((1, 2), np.float32),
                 ),
                 np.zeros(1, np.float32), np.zeros(1, np.float32),
                 np.array([False]), np.array([step == length - 1]),
+                Ending(observation, truth) if step == length - 1 else None,
             )  # fmt: skip
 
 
@@ -265,7 +265,7 @@ def test_the_command_names_a_bad_bag_in_one_line(tmp_path):
 def test_what_is_recorded_can_be_learned_from_and_learning_goes_on_where_it_stopped(tmp_path):
     stack = Stack({role: Choice(role, "oracle") for role in ROLES})
     job = Job(tmp_path / "bags", "", MixedEpisodes(2, SEED, [1]), stack, Disturbance(), 2, 24, 0)
-    assert record(job) == sum(t.count for b in find_bags([job.out]) for t in [open_checked(b).topics["/pose"]])
+    assert record(job) == sum(t.count for b in find_bags([job.out]) for t in [open_checked(b).topics["/torque"]])
     config = TrainConfig(LearnerConfig(window_frames=8), streams=1, length=8, steps=2)
     options = Options((job.out,), tmp_path / "run", (job.out,), out=tmp_path / "weights", config=config, workers=0)
     Trainer(options).train()

@@ -1,0 +1,134 @@
+"""What the simulator says of one robot in a tick, as messages: the same in the graph and in recorded rollouts.
+
+Nothing here needs rclpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from mujoban_core.bodies import Body
+from mujoban_core.camera import camera_intrinsics
+from mujoban_core.grid import BOX, TARGET
+from mujoban_core.interfaces import GroundTruth, Observation
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.topics import Topic
+from mujoban_sokoban.episodes import EpisodeSpec
+
+
+class TickLabel(NamedTuple):
+    """What names a tick besides the state of the world."""
+
+    stamp: int
+    """Simulated time [ns]."""
+    episode: int
+    """Number of the episode, from 1."""
+    difficulty: int
+    sequence: int
+    """Number of the instruction in force before this tick, 0 for none."""
+
+
+class EpisodeProgress(NamedTuple):
+    """How far an episode is."""
+
+    spec: EpisodeSpec
+    step: int
+    """Steps so far."""
+    reward: float
+    """Of the step before."""
+    episode_return: float
+    solved: bool
+    truncated: bool
+
+
+class SimulatorTick(NamedTuple):
+    """One tick of the robot in row `row` of a batch."""
+
+    label: TickLabel
+    progress: EpisodeProgress
+    observation: Observation
+    truth: GroundTruth
+    row: int
+
+
+class TickComposer:
+    """Composes the messages of `topics.SIMULATOR_TOPICS`, but for the view from above."""
+
+    def __init__(self, body: Body) -> None:
+        """Compose for robots of a body."""
+        self._joints = list(body.joints)
+        self._intrinsics = camera_intrinsics(body.camera)
+        self._spec: EpisodeSpec | None = None
+        self._level_text = ""
+        self._composers: dict[Topic, Callable[[SimulatorTick], Any]] = {
+            topics.CLOCK: lambda tick: conversions.clock_to_msg(tick.label.stamp),
+            topics.EPISODE: self._episode,
+            topics.CAMERA: self._camera,
+            topics.CAMERA_INFO: self._camera_info,
+            topics.PROPRIO: self._proprio,
+            topics.POSE: lambda tick: conversions.pose_to_msg(_map(tick), tick.observation.pose[tick.row]),
+            topics.TRUE_ABSTRACT_STATE: self._abstract_state,
+            topics.TRUE_POSE: lambda tick: conversions.pose_to_msg(_map(tick), tick.truth.pose[tick.row]),
+            topics.TRUE_TWIST: lambda tick: conversions.twist_to_msg(_map(tick), tick.truth.velocity[tick.row]),
+            topics.TRUE_BOXES: self._boxes,
+            topics.TRUE_TERMINATION: self._termination,
+        }
+        self.topics = tuple(self._composers)
+        """In the order in which the simulator speaks."""
+
+    def compose(self, topic: Topic, tick: SimulatorTick) -> Any:
+        """Return the message of a topic.
+
+        Raises:
+            KeyError: If it is not one of `topics`.
+            ConversionError: If the tick holds what the message cannot carry.
+        """
+        return self._composers[topic](tick)
+
+    def _episode(self, tick: SimulatorTick) -> Any:
+        label, progress = tick.label, tick.progress
+        if progress.spec is not self._spec:
+            self._spec, self._level_text = progress.spec, progress.spec.level.to_text()
+        state = tick.truth.abstract_state[tick.row]
+        reading = conversions.EpisodeReading(
+            episode=label.episode,
+            seed=progress.spec.seed,
+            difficulty=label.difficulty,
+            level=self._level_text,
+            step=progress.step,
+            reward=progress.reward,
+            episode_return=progress.episode_return,
+            solved=progress.solved,
+            terminated=progress.solved,
+            truncated=progress.truncated,
+            boxes_on_target=int((state[..., BOX] * state[..., TARGET]).sum()),
+        )
+        return conversions.episode_to_msg(_map(tick), reading)
+
+    def _camera(self, tick: SimulatorTick) -> Any:
+        header = conversions.header(tick.label.stamp, topics.CAMERA_FRAME)
+        return conversions.frame_to_msg(header, tick.observation.frame[tick.row])
+
+    def _camera_info(self, tick: SimulatorTick) -> Any:
+        header = conversions.header(tick.label.stamp, topics.CAMERA_FRAME)
+        return conversions.camera_info_to_msg(header, self._intrinsics)
+
+    def _proprio(self, tick: SimulatorTick) -> Any:
+        header = conversions.header(tick.label.stamp, topics.BODY_FRAME)
+        return conversions.proprio_to_msg(header, tick.observation.proprio[tick.row], self._joints)
+
+    def _abstract_state(self, tick: SimulatorTick) -> Any:
+        return conversions.abstract_state_to_msg(_map(tick), tick.truth.abstract_state[tick.row])
+
+    def _boxes(self, tick: SimulatorTick) -> Any:
+        present = tick.truth.box_position[tick.row, : len(tick.progress.spec.level.boxes)]
+        return conversions.boxes_to_msg(_map(tick), present)
+
+    def _termination(self, tick: SimulatorTick) -> Any:
+        completed = bool(tick.truth.completed[tick.row])
+        return conversions.termination_to_msg(_map(tick), tick.label.sequence, float(completed), completed)
+
+
+def _map(tick: SimulatorTick) -> Any:
+    return conversions.header(tick.label.stamp, topics.MAP_FRAME)
