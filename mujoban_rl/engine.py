@@ -26,7 +26,7 @@ from torch.optim import Optimizer
 
 from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
 from mujoban_rl.progress import Budget, Clock, Meter, Progress
-from mujoban_rl.run_directory import RunDirectory, Snapshot
+from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.training_log import TrainingLog
 
 BatchT = TypeVar("BatchT")
@@ -41,6 +41,20 @@ class State:
     """JSON values: random states, counters."""
     tensors: dict[str, Tensor] = field(default_factory=dict)
     """Replay, recurrent states, `torch.Generator` states."""
+
+    @classmethod
+    def of(cls, parts: Mapping[str, State]) -> State:
+        """Return the state of a whole, given those of its parts by name; names must be without dots."""
+        return cls(
+            {name: state.values for name, state in parts.items()},
+            {f"{name}.{k}": tensor for name, state in parts.items() for k, tensor in state.tensors.items()},
+        )
+
+    def part(self, name: str) -> State:
+        """Return the state of one part of a whole."""
+        prefix = f"{name}."
+        tensors = {k.removeprefix(prefix): v for k, v in self.tensors.items() if k.startswith(prefix)}
+        return State(self.values[name], tensors)
 
 
 class _Part(ABC):  # noqa: B024 - all of it has a default
@@ -265,8 +279,8 @@ class Trainer(Generic[BatchT]):
     def save(self) -> None:
         """Write a checkpoint, and export the weights with their record."""
         parts = {"learner": self.learner, "source": self.source}
-        states = {name: part.state() for name, part in parts.items()}
-        states["published"] = State({"version": self._version}, self._published or {})
+        published = State({"version": self._version}, self._published or {})
+        state = State.of({name: part.state() for name, part in parts.items()} | {"published": published})
         self.directory.save(
             self.progress.updates,
             modules={f"{name}.{k}": v for name, part in parts.items() for k, v in part.modules.items()},
@@ -275,9 +289,9 @@ class Trainer(Generic[BatchT]):
                 "progress": vars(self.progress),
                 "metrics": self.metrics,
                 "skipped": self._guard.skipped,
-                **{name: state.values for name, state in states.items()},
+                **state.values,
             },
-            tensors={f"{name}.{k}": v for name, state in states.items() for k, v in state.tensors.items()},
+            tensors=state.tensors,
         )
         record = {**self._record, **vars(self.progress), "metrics": self.metrics}
         self.learner.export(self.directory, record)
@@ -293,9 +307,10 @@ class Trainer(Generic[BatchT]):
         self.progress = Progress(**snapshot.extra["progress"])
         self.metrics = snapshot.extra["metrics"]
         self._guard.skipped = snapshot.extra["skipped"]
+        state = State(snapshot.extra, snapshot.tensors)
         for name, part in parts.items():
-            part.restore(_state_of(snapshot, name))
-        published = _state_of(snapshot, "published")
+            part.restore(state.part(name))
+        published = state.part("published")
         self._published, self._version = published.tensors, published.values["version"]
         self.source.samples = self.progress.samples
 
@@ -311,9 +326,3 @@ class _Limits:
     def reached(self, progress: Progress) -> bool:
         """Return whether one of the limits is reached."""
         return self.time.reached or progress.samples >= self.samples or progress.updates >= self.updates
-
-
-def _state_of(snapshot: Snapshot, name: str) -> State:
-    prefix = f"{name}."
-    tensors = {k.removeprefix(prefix): v for k, v in snapshot.tensors.items() if k.startswith(prefix)}
-    return State(snapshot.extra[name], tensors)
