@@ -21,7 +21,7 @@ from mujoban_core.interfaces import EstimatorInput, TerminationInput
 from mujoban_estimator.bag_stream import ReadReport, find_bags, open_checked, stretches
 from mujoban_estimator.data import Batch
 from mujoban_estimator.estimator import StateEstimator
-from mujoban_estimator.learner import Learner, LearnerConfig
+from mujoban_estimator.learner import EstimatorLearner, TrainConfig
 from mujoban_estimator.termination import ControlTermination
 
 
@@ -52,7 +52,7 @@ def step_times(repeats: int) -> dict[str, float]:
 def training_rate(steps: int, streams: int = 4, ticks: int = 64) -> float:
     """Return the ticks that training takes in per second, without reading them."""
     rng = np.random.default_rng(0)
-    learner = Learner(LearnerConfig(), streams, rng)
+    learner = EstimatorLearner(TrainConfig(streams=streams, length=ticks))
     state = np.zeros((streams, ticks, 10, 10, 4), np.float32)
     state[..., 5, 5, 2] = 1.0
     flags = np.zeros((streams, ticks), np.bool_)

@@ -141,30 +141,69 @@ def stretches(bag: Bag, length: int, report: ReadReport) -> Iterator[Stretch]:
         yield episode.take()
 
 
-def endless(
-    paths: Sequence[Path],
-    length: int,
-    rng: np.random.Generator,
-    report: ReadReport,
-    *,
-    skip_damaged: bool = False,
-    allow_test_seeds: bool = False,
-) -> Iterator[Stretch]:
-    """Yield the stretches of all bags, one bag after the other in an order that is drawn anew each time, for ever.
+class BagStream(Iterator[Stretch]):
+    """The stretches of all bags, one bag after the other in an order that is drawn anew each time, for ever."""
 
-    Raises:
-        BagError: as `open_checked`, if no bag holds a whole tick, or if one holds an episode with a seed that is kept
-            for tests and that is not allowed.
-    """
-    while True:
-        before = report.ticks
-        for i in rng.permutation(len(paths)):
-            for stretch in stretches(open_checked(paths[i], skip_damaged=skip_damaged), length, report):
-                if report.test_seeds and not allow_test_seeds:
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        length: int,
+        rng: np.random.Generator,
+        report: ReadReport | None = None,
+        *,
+        skip_damaged: bool = False,
+        allow_test_seeds: bool = False,
+    ) -> None:
+        """Read stretches of `length` ticks from `paths`; `rng` draws the order."""
+        self._paths, self._length, self._rng = list(paths), length, rng
+        self._report = report or ReadReport()
+        self._skip_damaged, self._allow_test_seeds = skip_damaged, allow_test_seeds
+        self._begin_round()
+
+    def _begin_round(self) -> None:
+        self._drawn_from = self._rng.bit_generator.state
+        self._order = self._rng.permutation(len(self._paths)).tolist()
+        self._bag, self._taken = 0, 0
+        self._before = self._report.ticks
+        self._reader: Iterator[Stretch] | None = None
+
+    def __next__(self) -> Stretch:
+        """Return the next stretch.
+
+        Raises:
+            BagError: As `open_checked`, if no bag holds a whole tick, or if one holds an episode with a seed that is
+                kept for tests and that is not allowed.
+        """
+        while True:
+            if self._bag == len(self._order):
+                if self._report.ticks == self._before:
                     raise BagError(
-                        f"{paths[i]} holds an episode with seed {min(report.test_seeds)}, which is kept for tests: "
-                        f"expected seeds from {TEST_SEEDS.stop} on, or --allow-test-seeds"
+                        f"none of {len(self._paths)} bags holds an episode from its start: nothing to learn from"
                     )
-                yield stretch
-        if report.ticks == before:
-            raise BagError(f"none of {len(paths)} bags holds an episode from its start: nothing to learn from")
+                self._begin_round()
+            path = self._paths[self._order[self._bag]]
+            if self._reader is None:
+                bag = open_checked(path, skip_damaged=self._skip_damaged)
+                self._reader = stretches(bag, self._length, self._report)
+            stretch = next(self._reader, None)
+            if self._report.test_seeds and not self._allow_test_seeds:
+                raise BagError(
+                    f"{path} holds an episode with seed {min(self._report.test_seeds)}, which is kept for tests: "
+                    f"expected seeds from {TEST_SEEDS.stop} on, or --allow-test-seeds"
+                )
+            if stretch is not None:
+                self._taken += 1
+                return stretch
+            self._bag, self._taken, self._reader = self._bag + 1, 0, None
+
+    def state(self) -> dict[str, Any]:
+        """Return where the stream is: JSON values."""
+        return {"drawn_from": self._drawn_from, "bag": self._bag, "taken": self._taken}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from where a stream of the same bags was, which reads the last bag again up to there."""
+        self._rng.bit_generator.state = state["drawn_from"]
+        self._begin_round()
+        self._bag = state["bag"]
+        for _ in range(state["taken"]):
+            next(self)

@@ -1,6 +1,6 @@
 """What a tick of a recording holds for training, in stretches of one episode each (paper C.1, C.4).
 
-Shapes: S streams, T ticks of a stretch, P proprioceptive values.
+Shapes: S streams, T ticks of a stretch, P proprioceptive values, W windows of V ticks, each within one instruction.
 """
 
 from __future__ import annotations
@@ -57,6 +57,40 @@ class Batch(NamedTuple):
     """Cells that are or were in view in the episode, [S, T, 10, 10]."""
 
 
+class Windows(NamedTuple):
+    """Stretches of ticks that each belong to one instruction and begin when it is issued."""
+
+    stream: NDArray[np.int64]
+    """[W]."""
+    tick: NDArray[np.int64]
+    """Ticks within the batch, padded by repeating the last, [W, V]."""
+    valid: NDArray[np.bool_]
+    """[W, V]."""
+
+
+def choose_windows(batch: Batch, frames: int, length: int, rng: np.random.Generator) -> Windows:
+    """Draw instructions that begin within a batch until their ticks number `frames`.
+
+    Args:
+        batch: the batch.
+        frames: about how many ticks to take.
+        length: most ticks of one instruction.
+        rng: source of the choice.
+    """
+    starts = batch.terminated & batch.valid
+    starts[:, 0] |= batch.first
+    ends = batch.valid.sum(axis=1)
+    stream, tick = np.nonzero(starts)
+    following = np.append(tick[1:], 0)
+    same = np.append(stream[1:] == stream[:-1], False)
+    count = np.minimum(np.where(same, following, ends[stream]) - tick, length)
+    order = rng.permutation(len(stream))
+    chosen = order[np.cumsum(count[order]) - count[order] < frames]
+    steps = np.arange(count[chosen].max(initial=1))
+    ticks = tick[chosen, None] + np.minimum(steps, count[chosen, None] - 1)
+    return Windows(stream[chosen], ticks, steps < count[chosen, None])
+
+
 class Batcher:
     """Joins streams of stretches into batches, and remembers per stream which cells have been seen."""
 
@@ -65,7 +99,8 @@ class Batcher:
         self._streams = list(streams)
         self._length = length
         self._body = body
-        self._seen = np.zeros((len(streams), GRID_SIZE, GRID_SIZE), np.bool_)
+        self.seen = np.zeros((len(streams), GRID_SIZE, GRID_SIZE), np.bool_)
+        """Cells that were in view earlier in each stream's episode, [S, 10, 10]; what a batch depends on before it."""
 
     def __iter__(self) -> Iterator[Batch]:
         """Return itself: batches come until every stream has ended."""
@@ -86,9 +121,9 @@ class Batcher:
         count = np.array([0 if s is None else len(s.frame) for s in stretches])
         valid = np.arange(self._length) < count[:, None]
         in_view = self._look(padded[6], padded[1])
-        self._seen[first] = False
-        seen = np.logical_or.accumulate(in_view, axis=1) | self._seen[:, None]
-        self._seen = seen[:, -1].copy()
+        self.seen[first] = False
+        seen = np.logical_or.accumulate(in_view, axis=1) | self.seen[:, None]
+        self.seen = seen[:, -1].copy()
         return Batch._make([*padded, valid, first, in_view, seen])
 
     def _look(self, abstract_state: NDArray[np.float32], pose: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -20,10 +20,9 @@ from torch import Tensor
 from mujoban_core.interfaces import INSTRUCTION_LIMIT, renew_rows
 from mujoban_estimator import SHIPPED, SHIPPED_TERMINATION, load, load_termination
 from mujoban_estimator.bag_stream import ReadReport, find_bags, open_checked, stretches
-from mujoban_estimator.data import Batch, Batcher, Stretch
+from mujoban_estimator.data import Batch, Batcher, Stretch, choose_windows
 from mujoban_estimator.encoder import FrameEncoder
 from mujoban_estimator.estimator import Belief, StateEstimator, probabilities
-from mujoban_estimator.learner import choose_windows
 from mujoban_estimator.metrics import MapScores, TerminationScores
 from mujoban_estimator.termination import ControlTermination
 

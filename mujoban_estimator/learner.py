@@ -1,26 +1,33 @@
 """One training step of state estimator and control termination together, on a shared ResNet (paper C.1, C.4).
 
-Shapes: S streams, T ticks of a stretch, K = T / `update_every` frames that the estimator takes in, W windows of V
-ticks, each within one instruction.
+Shapes: S streams, T ticks of a stretch, K = T / `update_every` frames that the estimator takes in.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from mujoban_core.grid import OFFSETS_XY
 from mujoban_core.interfaces import renew_rows
-from mujoban_estimator.data import Batch
+from mujoban_estimator.data import Batch, Windows, choose_windows
 from mujoban_estimator.estimator import Belief, EstimatorConfig, StateEstimator
+from mujoban_estimator.evaluate import evaluate
 from mujoban_estimator.losses import Views, estimator_loss, termination_loss
 from mujoban_estimator.odometry import Track
 from mujoban_estimator.termination import ControlTermination, TerminationConfig, true_phases
+from mujoban_rl.engine import Learner, State
+from mujoban_rl.limits import NaNGuard
+from mujoban_rl.optimise import ProgressSchedule, guarded_step
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.weights import load_weights, save_weights
 
 
 @dataclass(frozen=True)
@@ -57,58 +64,118 @@ class LearnerConfig:
                 raise ValueError(f"{name} is {getattr(self, name)}: expected at least 1")
 
 
-class Windows(NamedTuple):
-    """Stretches of ticks that each belong to one instruction and begin when it is issued."""
+@dataclass(frozen=True)
+class TrainConfig:
+    """What must not change between the bits of a run."""
 
-    stream: NDArray[np.int64]
-    """[W]."""
-    tick: NDArray[np.int64]
-    """Ticks within the batch, padded by repeating the last, [W, V]."""
-    valid: NDArray[np.bool_]
-    """[W, V]."""
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    streams: int = 4
+    """Bags that are read side by side; each is a row of the batch, whose memory goes on from step to step."""
+    length: int = 64
+    """Ticks of a stretch, a multiple of `update_every`."""
+    steps: int = 20_000
+    """Steps of the run, and of the learning-rate schedule."""
+    learning_rate: float = 1.5e-3
+    warm_up: int = 50
+    final_rate: float = 0.03
+    """Learning rate at the last step, as a share of `learning_rate`; it falls linearly."""
+    clip: float = 1.0
+    """Largest norm of the gradient."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Reject what contradicts itself."""
+        every = self.learner.estimator.update_every
+        if self.length < 1 or self.length % every:
+            raise ValueError(f"length is {self.length}: expected a multiple of update_every, {every}")
+        if self.streams < 1 or self.steps < 1:
+            raise ValueError(f"{self.streams} streams, {self.steps} steps: expected at least 1")
+
+    def rate(self, progress: float) -> float:
+        """Return the learning rate as a share of `learning_rate`: linear warm-up, then linear decay."""
+        decay = max(self.final_rate, 1.0 - progress)
+        return min(1.0, (progress * self.steps + 1) / self.warm_up) * decay
 
 
-def choose_windows(batch: Batch, frames: int, length: int, rng: np.random.Generator) -> Windows:
-    """Draw instructions that begin within a batch until their ticks number `frames`.
+class EstimatorLearner(Learner[Batch]):
+    """Trains both modules, with what they remember of each stream; a batch continues the one before."""
 
-    Args:
-        batch: the batch.
-        frames: about how many ticks to take.
-        length: most ticks of one instruction.
-        rng: source of the choice.
-    """
-    starts = batch.terminated & batch.valid
-    starts[:, 0] |= batch.first
-    ends = batch.valid.sum(axis=1)
-    stream, tick = np.nonzero(starts)
-    following = np.append(tick[1:], 0)
-    same = np.append(stream[1:] == stream[:-1], False)
-    count = np.minimum(np.where(same, following, ends[stream]) - tick, length)
-    order = rng.permutation(len(stream))
-    chosen = order[np.cumsum(count[order]) - count[order] < frames]
-    steps = np.arange(count[chosen].max(initial=1))
-    ticks = tick[chosen, None] + np.minimum(steps, count[chosen, None] - 1)
-    return Windows(stream[chosen], ticks, steps < count[chosen, None])
+    def __init__(
+        self, config: TrainConfig, *, device: str = "cpu", validation: Sequence[Path] = (), out: Path | None = None
+    ) -> None:
+        """Make both modules on one shared ResNet.
 
-
-class Learner:
-    """Holds both modules, what they remember of each stream, and computes the loss of a batch."""
-
-    def __init__(self, config: LearnerConfig, streams: int, rng: np.random.Generator, device: str = "cpu") -> None:
-        """Make both modules on one shared ResNet, for batches of `streams` streams."""
-        self.config = config
+        Args:
+            config: Settings; the seed decides weights and every draw.
+            device: Where the modules learn.
+            validation: Bags to evaluate on; none: no evaluation.
+            out: Folder that receives the weights of both modules, if any.
+        """
+        self.training, self.config = config, config.learner
         self.device = torch.device(device)
-        self.rng = rng
-        estimator = vars(config.estimator)
-        self.estimator = StateEstimator(**estimator).to(self.device)
-        self.termination = ControlTermination(self.estimator.encoder, **vars(config.termination)).to(self.device)
-        self._belief = self.estimator.initial_belief(streams)
-        self._track = self._lost_track(streams)
+        self.rng = np.random.default_rng(config.seed)
+        torch.manual_seed(config.seed)  # the initial weights
+        self.estimator = StateEstimator(**vars(self.config.estimator)).to(self.device)
+        self.termination = ControlTermination(self.estimator.encoder, **vars(self.config.termination)).to(self.device)
+        both = {id(p): p for module in self.modules.values() for p in module.parameters()}
+        self.optimiser = torch.optim.Adam(both.values(), config.learning_rate)
+        self._schedule = ProgressSchedule(self.optimiser, config.rate)
+        self._validation, self._out = list(validation), out
+        self._belief = self.estimator.initial_belief(config.streams)
+        self._track = self._lost_track(config.streams)
 
-    def parameters(self) -> list[torch.nn.Parameter]:
-        """Return the parameters of both modules, shared ones once."""
-        both = {id(p): p for module in (self.estimator, self.termination) for p in module.parameters()}
-        return list(both.values())
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """Both modules; the ResNet is part of either."""
+        return {"estimator": self.estimator, "termination": self.termination}
+
+    @property
+    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """One for all."""
+        return {"adam": self.optimiser}
+
+    def start_from(self, folder: Path) -> None:
+        """Begin with the weights of former modules; the ResNet is the estimator's.
+
+        Raises:
+            WeightsError: If a file is missing, damaged or does not fit.
+        """
+        for name, module in (("termination", self.termination), ("estimator", self.estimator)):
+            module.load_state_dict(load_weights(type(module), folder / f"{name}.safetensors").state_dict())
+
+    def update(self, batch: Batch, progress: float, guard: NaNGuard) -> dict[str, float]:
+        """Take one gradient step; return the parts of the loss."""
+        memory = self._belief, self._track
+        loss, parts = self.loss(batch)
+        if guarded_step(loss, [self.optimiser], guard, clip=self.training.clip) is None:
+            # What a refused batch left in memory would spoil those to come.
+            self._belief, self._track = memory
+        self._schedule.follow(progress)
+        return {f"train/{name}": float(value) for name, value in parts.items()}
+
+    def state(self) -> State:
+        """Return the random state and what the modules remember of each stream."""
+        tensors = {f"belief.{k}": v for k, v in self._belief._asdict().items()}
+        tensors |= {f"track.{k}": v for k, v in self._track._asdict().items()}
+        return State({"rng": self.rng.bit_generator.state}, tensors)
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self.rng.bit_generator.state = state.values["rng"]
+        tensors = {k: v.to(self.device) for k, v in state.tensors.items()}
+        self._belief = Belief(*(tensors[f"belief.{k}"] for k in Belief._fields))
+        self._track = Track(*(tensors[f"track.{k}"] for k in Track._fields))
+
+    def evaluate(self) -> dict[str, float]:
+        """Return the rates of both modules on the validation bags."""
+        return evaluate(self.estimator, self.termination, self._validation) if self._validation else {}
+
+    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
+        """Write the weights of both modules where they are asked for."""
+        if self._out is None:
+            return
+        for name, module in (("estimator", self.estimator), ("termination", self.termination)):
+            save_weights(self._out / f"{name}.safetensors", module, module.hyperparameters(), record)
 
     def _lost_track(self, streams: int) -> Track:
         """Return tracks at the start of episodes whose odometers are off."""

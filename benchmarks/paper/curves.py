@@ -39,13 +39,16 @@ class Measure(NamedTuple):
 
 MEASURES: Final = {
     "controller": (Measure(("instruction/move", "instruction/push"), "instructions completed"),),
-    "planner": (Measure(("solve_rate/5",), "levels solved"), Measure(("train/accuracy",), "decisions right")),
+    "planner": (
+        Measure(("evaluation/solve_rate/5",), "levels solved"),
+        Measure(("train/accuracy",), "decisions right"),
+    ),
     "estimator": (
-        Measure(("valid/box_recall_in_view",), "boxes in view found"),
+        Measure(("evaluation/box_recall_in_view",), "boxes in view found"),
         Measure(("train/box",), "loss of the box layer"),
     ),
     "termination": (
-        Measure(("valid/termination_precision",), "terminations in time"),
+        Measure(("evaluation/termination_precision",), "terminations in time"),
         Measure(("train/beta",), "loss of beta"),
     ),
 }
@@ -80,8 +83,7 @@ def read_curve(module: str, runs: Sequence[Path], offset: float = 0.0) -> list[d
             metrics = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
         except (OSError, json.JSONDecodeError) as error:
             raise ResultError(f"{run}: expected the run directory of a trainer ({error})") from error
-        scale = _samples_per_step(run)
-        lines += [(offset + scale * line["step"], line) for line in metrics]
+        lines += [(offset + line["step"], line) for line in metrics]
         offset = lines[-1][0] if lines else offset
     for measure in MEASURES[module]:
         points = [(step, *value) for step, line in lines if (value := _value(line, measure)) is not None]
@@ -96,15 +98,6 @@ def _value(line: dict[str, Any], measure: Measure) -> tuple[float, float] | None
     present = [(line[key], line.get(f"{key}_n", 1.0)) for key in measure.keys if line.get(key) is not None]
     total = sum(count for _, count in present)
     return (sum(value * count for value, count in present) / total, total) if total else None
-
-
-def _samples_per_step(run: Path) -> float:
-    """Return how many samples a step of the run takes; where steps are samples already, 1."""
-    try:
-        config = json.loads((run / "config.json").read_text())
-        return config["streams"] * config["length"]
-    except (OSError, KeyError, json.JSONDecodeError):
-        return 1.0
 
 
 def _thin(points: Sequence[tuple[float, float, float]]) -> list[tuple[float, float]]:

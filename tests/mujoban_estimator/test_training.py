@@ -17,15 +17,18 @@ from mujoban_core.interfaces import GroundTruth, Observation, TerminationOutput
 from mujoban_core.plugins import ROLES
 from mujoban_core.sense_plan_act import Decision
 from mujoban_estimator import load, load_termination
-from mujoban_estimator.bag_stream import ReadReport, endless, find_bags, open_checked, stretches
-from mujoban_estimator.data import Batcher, Stretch
-from mujoban_estimator.learner import Learner, LearnerConfig, choose_windows
+from mujoban_estimator.bag_stream import BagStream, ReadReport, find_bags, open_checked, stretches
+from mujoban_estimator.data import Batcher, Stretch, choose_windows
+from mujoban_estimator.estimator import EstimatorConfig
+from mujoban_estimator.learner import EstimatorLearner, LearnerConfig, TrainConfig
 from mujoban_estimator.losses import missed_steps
 from mujoban_estimator.metrics import MapScores, TerminationScores
 from mujoban_estimator.termination import TerminationConfig
-from mujoban_estimator.train import Options, TrainConfig, Trainer, learning_rate
+from mujoban_estimator.train import Options, make_trainer
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
+from mujoban_rl.limits import NaNGuard
+from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
 SEED = TRAIN_SEEDS.start
@@ -138,8 +141,8 @@ def test_episodes_kept_for_tests_are_refused(tmp_path):
             recorder.write(tick)
     paths = find_bags([tmp_path])
     with pytest.raises(BagError, match="seed 1000"):
-        next(endless(paths, 8, np.random.default_rng(0), ReadReport()))
-    assert next(endless(paths, 8, np.random.default_rng(0), ReadReport(), allow_test_seeds=True)).first
+        next(BagStream(paths, 8, np.random.default_rng(0)))
+    assert next(BagStream(paths, 8, np.random.default_rng(0), allow_test_seeds=True)).first
 
 
 def stretch(ticks, *, first=True, terminated=(), completed=()):
@@ -194,31 +197,26 @@ def test_missed_steps_count_earlier_negatives_under_a_positive_label():
 
 
 def test_a_learner_fits_what_it_sees_again_and_again():
-    torch.manual_seed(0)
-    learner = Learner(LearnerConfig(window_frames=16), 1, np.random.default_rng(0))
-    optimiser = torch.optim.Adam(learner.parameters(), 3e-3)
+    config = TrainConfig(LearnerConfig(window_frames=16), streams=1, learning_rate=3e-3, warm_up=1)
+    learner = EstimatorLearner(config)
     batch = next(Batcher([iter([stretch(16, terminated=(8,), completed=(7, 14, 15))])], 16, BALL))
-    losses = []
+    before = learner.loss(batch)[0].item()
     for _ in range(30):
-        optimiser.zero_grad()
-        loss, _ = learner.loss(batch)
-        loss.backward()
-        optimiser.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.6 * losses[0]
+        learner.update(batch, 0.0, NaNGuard())
+    assert learner.loss(batch)[0].item() < 0.6 * before
 
 
 def test_estimator_and_termination_must_share_the_resnet():
     with pytest.raises(ValueError, match="channels"):
         LearnerConfig(termination=TerminationConfig(channels=8))
-    learner = Learner(LearnerConfig(), 1, np.random.default_rng(0))
+    learner = EstimatorLearner(TrainConfig())
     assert learner.estimator.encoder is learner.termination.encoder
 
 
 def test_the_learning_rate_warms_up_and_falls():
-    config = TrainConfig(steps=1000, warm_up=10, learning_rate=1.0, final_rate=0.1)
-    assert learning_rate(0, config) == pytest.approx(0.1) and learning_rate(500, config) == pytest.approx(0.5)
-    assert learning_rate(5000, config) == pytest.approx(0.1)
+    config = TrainConfig(steps=1000, warm_up=10, final_rate=0.1)
+    assert config.rate(0.0) == pytest.approx(0.1) and config.rate(0.5) == pytest.approx(0.5)
+    assert config.rate(1.0) == pytest.approx(0.1)
 
 
 def test_map_scores_tell_apart_what_was_seen():
@@ -267,9 +265,47 @@ def test_what_is_recorded_can_be_learned_from_and_learning_goes_on_where_it_stop
     job = Job(tmp_path / "bags", "", MixedEpisodes(2, SEED, [1]), stack, Disturbance(), 2, 24, 0)
     assert record(job) == sum(t.count for b in find_bags([job.out]) for t in [open_checked(b).topics["/torque"]])
     config = TrainConfig(LearnerConfig(window_frames=8), streams=1, length=8, steps=2)
-    options = Options((job.out,), tmp_path / "run", (job.out,), out=tmp_path / "weights", config=config, workers=0)
-    Trainer(options).train()
-    assert Trainer(options).step == 2
+    options = Options((job.out,), tmp_path / "run", (job.out,), out=tmp_path / "weights", config=config)
+    make_trainer(options).run()
+    again = make_trainer(options)
+    assert again.complete and again.metrics["ticks"] == 48
     estimator = load(tmp_path / "weights" / "estimator.safetensors")
     assert estimator.config == config.learner.estimator
     assert load_termination(tmp_path / "weights" / "termination.safetensors").limit == 120
+
+
+@pytest.fixture
+def make(bags):
+    small = EstimatorConfig(channels=8, blocks=1), TerminationConfig(channels=8, blocks=1)
+    config = TrainConfig(LearnerConfig(*small, window_frames=8), streams=2, length=4, steps=20, warm_up=1)
+
+    def make(path, workers=0, bags=bags):
+        return make_trainer(Options((bags,), path, config=config, workers=workers))
+
+    return make
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_run_that_is_terminated_and_resumed_equals_one_that_never_stopped(make, tmp_path, workers):
+    # The bag ends, and is read again, within these updates.
+    check_resuming(lambda path: make(path, workers), tmp_path, stop_at=4, updates=8)
+
+
+def test_a_batch_with_nan_leaves_both_modules_their_memory_and_the_optimiser_untouched(make, tmp_path):
+    def poisoned(batch):
+        return batch._replace(proprio=batch.proprio * np.nan, pose=batch.pose * np.nan)
+
+    check_refusal(make(tmp_path), poisoned)
+
+
+def test_other_bags_may_be_learned_from_in_the_next_bit_of_a_run(bags, make, tmp_path):
+    make(tmp_path / "run").run(limit_updates=1)
+    copy_without(open_checked(find_bags([bags])[0]), tmp_path / "other", lambda *_: False)
+    resumed = make(tmp_path / "run", bags=tmp_path / "other")
+    resumed.run(limit_updates=2)
+    assert resumed.progress.updates == 2
+
+
+def test_more_than_one_reading_process_is_refused(make, tmp_path):
+    with pytest.raises(ValueError, match="workers is 2: expected 1"):
+        make(tmp_path, workers=2)
