@@ -1,0 +1,223 @@
+"""Run stages, each a command of its own, in the order in which they need each other; stop and go on at any point.
+
+What is done stands in `pipeline.json` of the run's directory: for every stage its command, the digests of what it
+came from and of what it made, and the time it took. A stage that was stopped is started again with the same command:
+every trainer of this project resumes from its directory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mujoban_core.files import write_atomically
+from mujoban_rl.limits import StopSignal
+
+_PERIOD = 0.2
+"""Seconds between two looks at the commands that run."""
+_GRACE = 90.0
+"""Seconds that a command has, after SIGTERM, to write its checkpoint."""
+_TAIL = 2000
+"""Characters of a failed command's log that the error shows."""
+
+
+class PipelineError(RuntimeError):
+    """A stage failed, or the stages cannot be run in any order."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A command with what it needs and makes."""
+
+    name: str
+    command: tuple[str, ...]
+    """Arguments of the Python interpreter."""
+    products: tuple[Path, ...]
+    """Files or folders that exist when it is done."""
+    needs: tuple[str, ...] = ()
+    """Names of the stages whose products it takes."""
+    seconds: float = 60.0
+    """How long it is expected to take; for the progress that is shown."""
+    cores: int = 1
+
+
+@dataclass
+class Entry:
+    """What the pipeline knows of a stage; kept in `pipeline.json`."""
+
+    command: list[str] = field(default_factory=list)
+    done: bool = False
+    seconds: float = 0.0
+    """Wall-clock, of all its starts together."""
+    inputs: dict[str, str] = field(default_factory=dict)
+    """SHA-256 digests of the products of the stages that it needed."""
+    outputs: dict[str, str] = field(default_factory=dict)
+
+
+def digest_tree(path: Path) -> str:
+    """Return the SHA-256 of a file, or of the names and contents of all files in a folder."""
+    total = hashlib.sha256()
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            total.update(file.relative_to(path).as_posix().encode() + b"\0")
+        with file.open("rb") as stream:
+            for block in iter(lambda: stream.read(1 << 20), b""):
+                total.update(block)
+    return total.hexdigest()
+
+
+class Pipeline:
+    """Stages of one run directory."""
+
+    def __init__(self, directory: Path, stages: Sequence[Stage], *, cores: int = 2) -> None:
+        """Open the run, taking over what was done before.
+
+        Args:
+            directory: The run's directory; logs go to `logs/STAGE.txt` in it.
+            stages: All stages.
+            cores: Stages run side by side while their cores do not add up to more; each runs alone if it wants more.
+
+        Raises:
+            PipelineError: If a need names no stage before it, or a stage that is done had another command.
+        """
+        self.directory, self.stages, self.cores = directory, tuple(stages), cores
+        self._file = directory / "pipeline.json"
+        stored: dict[str, Any] = json.loads(self._file.read_text()) if self._file.exists() else {}
+        self.entries = {s.name: Entry(**stored[s.name]) if s.name in stored else Entry() for s in self.stages}
+        known: set[str] = set()
+        for stage in self.stages:
+            if missing := [need for need in stage.needs if need not in known]:
+                raise PipelineError(f"stage {stage.name} needs {', '.join(missing)}: expected stages before it")
+            known.add(stage.name)
+            self._check_command(stage)
+        self._running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}
+
+    def _check_command(self, stage: Stage) -> None:
+        entry = self.entries[stage.name]
+        if entry.command and entry.command != list(stage.command):
+            raise PipelineError(
+                f"{self.directory}: stage {stage.name} ran as {' '.join(entry.command)}, not as "
+                f"{' '.join(stage.command)}; expected the options of before, or another directory"
+            )
+
+    @property
+    def done(self) -> bool:
+        """Whether every stage is done."""
+        return all(entry.done for entry in self.entries.values())
+
+    def elapsed(self, name: str) -> float:
+        """Return the seconds that a stage has taken so far, in all its starts."""
+        started = self._running.get(name)
+        return self.entries[name].seconds + (time.monotonic() - started[1] if started else 0.0)
+
+    def running(self) -> list[str]:
+        """Return the names of the stages that run now."""
+        return list(self._running)
+
+    def run(self, on_tick: Callable[[Pipeline], None] | None = None) -> bool:
+        """Run what is not done yet; SIGINT and SIGTERM stop the commands, which keep their checkpoints.
+
+        Args:
+            on_tick: Called several times a second, to show progress.
+
+        Returns:
+            Whether every stage is done.
+
+        Raises:
+            PipelineError: If a command fails or does not make what it should; the others are stopped.
+        """
+        try:
+            with StopSignal() as stop:
+                while not self.done and not stop.requested:
+                    self._start_ready()
+                    self._reap()
+                    if on_tick is not None:
+                        on_tick(self)
+                    time.sleep(_PERIOD)
+        finally:
+            self._stop_all()
+        return self.done
+
+    def _start_ready(self) -> None:
+        used = sum(s.cores for s in self.stages if s.name in self._running)
+        for stage in self.stages:
+            entry = self.entries[stage.name]
+            if entry.done or stage.name in self._running or not all(self.entries[n].done for n in stage.needs):
+                continue
+            if used and used + stage.cores > self.cores:
+                continue
+            self._start(stage)
+            used += stage.cores
+
+    def _start(self, stage: Stage) -> None:
+        entry = self.entries[stage.name]
+        entry.command = list(stage.command)
+        entry.inputs = {k: v for need in stage.needs for k, v in self.entries[need].outputs.items()}
+        self._save()
+        log = self._log(stage.name)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("ab") as output:
+            process = subprocess.Popen(
+                [sys.executable, *stage.command], stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+                start_new_session=True, env={**os.environ, "OMP_NUM_THREADS": str(stage.cores)},
+            )  # fmt: skip
+        self._running[stage.name] = (process, time.monotonic())
+
+    def _reap(self) -> None:
+        for stage in self.stages:
+            if stage.name not in self._running:
+                continue
+            code = self._running[stage.name][0].poll()
+            if code is None:
+                continue
+            self._finish(stage.name)
+            if code != 0:
+                log = self._log(stage.name)
+                tail = log.read_text(errors="replace")[-_TAIL:]
+                raise PipelineError(f"stage {stage.name} ended with {code}; its log {log} ends: {tail}")
+            if missing := [str(p) for p in stage.products if not p.exists()]:
+                raise PipelineError(f"stage {stage.name} ended without {', '.join(missing)}")
+            entry = self.entries[stage.name]
+            entry.outputs = {_name(p, self.directory): digest_tree(p) for p in stage.products}
+            entry.done = True
+            self._save()
+
+    def _finish(self, name: str) -> None:
+        self.entries[name].seconds = self.elapsed(name)
+        del self._running[name]
+        self._save()
+
+    def _stop_all(self) -> None:
+        for process, _ in self._running.values():
+            process.send_signal(signal.SIGTERM)
+        end = time.monotonic() + _GRACE
+        for name in self.running():
+            process = self._running[name][0]
+            try:
+                process.wait(max(0.0, end - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            self._finish(name)
+
+    def _log(self, name: str) -> Path:
+        return self.directory / "logs" / f"{name}.txt"
+
+    def _save(self) -> None:
+        self.directory.mkdir(parents=True, exist_ok=True)
+        content: Mapping[str, Any] = {name: asdict(entry) for name, entry in self.entries.items() if entry.command}
+        write_atomically(self._file, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def _name(path: Path, directory: Path) -> str:
+    return path.relative_to(directory).as_posix() if path.is_relative_to(directory) else str(path)

@@ -1,0 +1,93 @@
+import json
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from bringup.pipeline import Pipeline, PipelineError, Stage, digest_tree
+
+COPY = "import sys, pathlib; pathlib.Path(sys.argv[2]).write_text(pathlib.Path(sys.argv[1]).read_text() + 'b')"
+# Counts its starts, ends well on SIGTERM as a trainer does, and is done at the second start.
+TRAINER = """
+import pathlib, signal, sys, time
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(0 if pathlib.Path(sys.argv[1]).exists() else 3))
+starts = pathlib.Path(sys.argv[2])
+starts.write_text((starts.read_text() if starts.exists() else '') + 'x')
+if starts.read_text() == 'x':
+    time.sleep(60)
+pathlib.Path(sys.argv[1]).write_text('trained')
+"""
+
+
+def write(path, text):
+    return ("-c", f"import pathlib; pathlib.Path({str(path)!r}).write_text({text!r})")
+
+
+def stages(folder):
+    a, b = folder / "a.txt", folder / "b.txt"
+    return [
+        Stage("first", write(a, "a"), (a,)),
+        Stage("second", ("-c", COPY, str(a), str(b)), (b,), needs=("first",)),
+    ]
+
+
+def test_stages_run_in_the_order_of_their_needs_and_only_once(tmp_path):
+    assert Pipeline(tmp_path, stages(tmp_path)).run()
+    assert (tmp_path / "b.txt").read_text() == "ab"
+    (tmp_path / "a.txt").write_text("changed")
+    assert Pipeline(tmp_path, stages(tmp_path)).run()
+    assert (tmp_path / "b.txt").read_text() == "ab"
+
+
+def test_the_record_holds_the_digests_of_what_each_stage_came_from(tmp_path):
+    Pipeline(tmp_path, stages(tmp_path)).run()
+    record = json.loads((tmp_path / "pipeline.json").read_text())
+    assert record["second"]["inputs"] == {"a.txt": digest_tree(tmp_path / "a.txt")} == record["first"]["outputs"]
+
+
+def test_a_stopped_run_ends_its_commands_and_goes_on_where_it_was(tmp_path):
+    product, starts = tmp_path / "weights", tmp_path / "starts"
+    stage = Stage("train", ("-c", TRAINER, str(product), str(starts)), (product,))
+
+    def interrupt():
+        while not starts.exists():
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=interrupt).start()
+    run = Pipeline(tmp_path, [stage])
+    assert not run.run() and not run.running()
+    again = Pipeline(tmp_path, [stage])
+    assert again.run() and starts.read_text() == "xx"
+    assert again.entries["train"].seconds > run.entries["train"].seconds > 0
+
+
+def test_a_failing_command_is_named_with_the_end_of_its_log(tmp_path):
+    stage = Stage("broken", ("-c", "import sys; sys.exit('no bags here')"), (tmp_path / "x",))
+    with pytest.raises(PipelineError, match=r"stage broken ended with 1; .*broken\.txt ends: no bags here"):
+        Pipeline(tmp_path, [stage]).run()
+    with pytest.raises(PipelineError, match="stage idle ended without"):
+        Pipeline(tmp_path, [Stage("idle", ("-c", ""), (tmp_path / "x",))]).run()
+
+
+def test_another_command_for_a_stage_that_began_is_refused(tmp_path):
+    Pipeline(tmp_path, stages(tmp_path)[:1]).run()
+    with pytest.raises(PipelineError, match="expected the options of before, or another directory"):
+        Pipeline(tmp_path, [Stage("first", ("-c", "pass"), ())])
+
+
+def test_stages_without_needs_run_side_by_side_up_to_the_cores(tmp_path):
+    def waits_for(mine, other):
+        code = f"import pathlib, time; pathlib.Path({str(mine)!r}).touch()\n"
+        code += f"while not pathlib.Path({str(other)!r}).exists(): time.sleep(0.02)"
+        return ("-c", code)
+
+    a, b = tmp_path / "a", tmp_path / "b"
+    assert Pipeline(tmp_path, [Stage("a", waits_for(a, b), (a,)), Stage("b", waits_for(b, a), (b,))], cores=2).run()
+
+
+def test_a_need_that_is_no_earlier_stage_is_refused(tmp_path):
+    with pytest.raises(PipelineError, match="stage second needs first"):
+        Pipeline(tmp_path, stages(tmp_path)[1:])
