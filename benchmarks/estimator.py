@@ -18,11 +18,12 @@ import tyro
 from benchmarks.timing import milliseconds
 from mujoban_core.bodies import BALL
 from mujoban_core.interfaces import EstimatorInput, TerminationInput
-from mujoban_estimator.bag_stream import ReadReport, find_bags, open_checked, stretches
+from mujoban_estimator.bag_stream import TOPICS, stretches
 from mujoban_estimator.data import Batch
 from mujoban_estimator.estimator import StateEstimator
 from mujoban_estimator.learner import EstimatorLearner, TrainConfig
 from mujoban_estimator.termination import ControlTermination
+from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def reading_rate(bags: tuple[Path, ...]) -> float:
     report = ReadReport()
     start = time.process_time()
     for path in find_bags(bags):
-        for _ in stretches(open_checked(path), 64, report):
+        for _ in stretches(open_training_bag(path, TOPICS), 64, report, allow_test_seeds=True):
             pass
     return report.ticks / (time.process_time() - start)
 

@@ -26,11 +26,10 @@ from mujoban_controller.replay import memory_fields
 from mujoban_core.bodies import Body, get_body
 from mujoban_core.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMIT, WALL, xy_to_cell
 from mujoban_core.interfaces import Memory
-from mujoban_estimator.bag_stream import find_bags
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.bags import Bag, BagError, open_bag
+from mujoban_msgs_py.bags import Bag, BagError
+from mujoban_msgs_py.bags.training import episode_ticks, find_bags, open_training_bag
 from mujoban_sim.goals import GoalTracker
-from mujoban_sokoban.generator import TEST_SEEDS
 
 TOPICS: Final = (
     topics.EPISODE,
@@ -51,39 +50,18 @@ Fields = dict[str, NDArray]
 Policy = PrivilegedPolicy | VisuomotorController
 
 
-def open_checked(path: Path) -> Bag:
-    """Open a bag that has every topic that training needs.
-
-    Raises:
-        BagError: If a topic is missing, by name, or the bag is damaged.
-    """
-    bag = open_bag(path)
-    missing = [t.name for t in TOPICS if t.name not in bag.topics or bag.topics[t.name].count == 0]
-    if missing:
-        raise BagError(f"{path} lacks {', '.join(missing)}: expected a bag with {', '.join(t.name for t in TOPICS)}")
-    return bag
-
-
 def episodes(bag: Bag) -> Iterator[list[tuple[Any, ...]]]:
     """Yield the ticks of each episode, in the order of `TOPICS`, from its start up to a tick that is missing.
 
     Raises:
-        BagError: If an episode has a seed that is kept for tests.
+        BagError: As `episode_ticks`.
     """
     found: list[tuple[Any, ...]] = []
-    for tick in bag.ticks(TOPICS):
-        reading = tick.values[0]
-        if reading.seed in TEST_SEEDS:
-            raise BagError(
-                f"{bag.path} holds an episode with seed {reading.seed}, which is kept for tests: expected seeds from "
-                f"{TEST_SEEDS.stop} on"
-            )
-        if reading.step == 0:
-            if found:
-                yield found
-            found = [tick.values]
-        elif found and (reading.episode, reading.step) == (found[0][0].episode, len(found)):
-            found.append(tick.values)
+    for reading, values in episode_ticks(bag, TOPICS):
+        if reading.step == 0 and found:
+            yield found
+            found = []
+        found.append(values)
     if found:
         yield found
 
@@ -209,7 +187,7 @@ class BagSequences:
             BagError: If there is no bag at a path, or one lacks a topic.
         """
         self._config, self._policy, self._length, self._rng = config, policy, length, rng
-        self._bags = [open_checked(path) for path in find_bags(paths)]
+        self._bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
         self._stream = self._endless()
 
     def __next__(self) -> tuple[Fields, Fields]:

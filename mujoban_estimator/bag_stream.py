@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,10 +11,8 @@ import numpy as np
 from mujoban_core.interfaces import NO_INSTRUCTION
 from mujoban_estimator.data import Stretch
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.bags import Bag, BagError, open_bag
-from mujoban_msgs_py.bags.metadata import FILE_NAME
-from mujoban_msgs_py.conversions import EpisodeReading
-from mujoban_sokoban.generator import TEST_SEEDS
+from mujoban_msgs_py.bags import Bag, BagError
+from mujoban_msgs_py.bags.training import ReadReport, episode_ticks, open_training_bag
 
 TOPICS: Final = (
     topics.EPISODE,
@@ -31,65 +27,10 @@ TOPICS: Final = (
 """What training needs of a bag."""
 
 
-def find_bags(folders: Sequence[Path]) -> list[Path]:
-    """Return the bags among the given paths: each is a bag, or a folder of bags.
-
-    Raises:
-        BagError: if there is none at a path.
-    """
-    found: list[Path] = []
-    for folder in folders:
-        if not folder.exists():
-            raise BagError(f"no bag at {folder}: expected a bag or a folder of bags")
-        if folder.is_file() or (folder / FILE_NAME).exists() or _has_files(folder):
-            found.append(folder)
-            continue
-        below = sorted(p for p in folder.iterdir() if p.is_dir() and ((p / FILE_NAME).exists() or _has_files(p)))
-        if not below:
-            raise BagError(f"no bag in {folder}: expected folders with {FILE_NAME}, .mcap or .db3 files")
-        found += below
-    return found
-
-
-def _has_files(folder: Path) -> bool:
-    return any(folder.glob("*.mcap")) or any(folder.glob("*.db3"))
-
-
-def open_checked(path: Path, *, skip_damaged: bool = False) -> Bag:
-    """Open a bag that has every topic that training needs.
-
-    Args:
-        path: The bag.
-        skip_damaged: Leave damaged chunks out instead of refusing the bag.
-
-    Raises:
-        BagError: if a topic is missing, by name, or the bag is damaged and that is not to be skipped.
-    """
-    bag = open_bag(path, damaged="skip" if skip_damaged else "refuse")
-    missing = [t.name for t in TOPICS if t.name not in bag.topics or bag.topics[t.name].count == 0]
-    if missing:
-        raise BagError(f"{path} lacks {', '.join(missing)}: expected a bag with {', '.join(t.name for t in TOPICS)}")
-    return bag
-
-
-@dataclass
-class ReadReport:
-    """What reading met with."""
-
-    ticks: int = 0
-    episodes: int = 0
-    skipped: Counter[str] = field(default_factory=Counter)
-    """Ticks that were left out, by reason."""
-    test_seeds: set[int] = field(default_factory=set)
-    """Seeds of episodes that are kept for tests."""
-
-
 class _Episode:
     """Gathers the ticks of an episode into stretches."""
 
-    def __init__(self, reading: EpisodeReading) -> None:
-        self.reading = reading
-        self.next_step = 0
+    def __init__(self) -> None:
         self.instruction, self.terminated = NO_INSTRUCTION, False
         self.first = True
         self.rows: list[tuple[Any, ...]] = []
@@ -98,7 +39,6 @@ class _Episode:
         _, frame, pose, proprio, instruction, termination, abstract_state, label = values
         self.rows.append((frame, pose, proprio, self.instruction, self.terminated, label.terminated, abstract_state))
         self.instruction, self.terminated = instruction.direction, termination.terminated
-        self.next_step += 1
 
     def take(self) -> Stretch:
         """Return what has been gathered and forget it."""
@@ -108,36 +48,26 @@ class _Episode:
         return stretch
 
 
-def stretches(bag: Bag, length: int, report: ReadReport) -> Iterator[Stretch]:
+def stretches(
+    bag: Bag, length: int, report: ReadReport, *, allow_test_seeds: bool = False
+) -> Iterator[Stretch]:
     """Yield the episodes of a bag in stretches of `length` ticks; the last of an episode may be shorter.
 
-    An episode is used from its first tick on, up to a tick that is missing: without it nobody can tell what the
-    modules remember. What is left out for that is counted in `report`.
+    What is left out is counted in `report`.
+
+    Raises:
+        BagError: As `episode_ticks`.
     """
-    episode: _Episode | None = None
-    for tick in bag.ticks(TOPICS):
-        reading: EpisodeReading = tick.values[0]
+    episode = _Episode()
+    for reading, values in episode_ticks(bag, TOPICS, report, allow_test_seeds=allow_test_seeds):
         if reading.step == 0:
-            if episode is not None and episode.rows:
-                yield episode.take()
-            episode = _Episode(reading)
-            report.episodes += 1
-            if reading.seed in TEST_SEEDS:
-                report.test_seeds.add(reading.seed)
-        if episode is None:
-            report.skipped["of an episode whose start is missing"] += 1
-            continue
-        if reading.episode != episode.reading.episode or reading.step != episode.next_step:
-            report.skipped["behind a gap"] += 1
             if episode.rows:
                 yield episode.take()
-            episode = None
-            continue
-        episode.add(tick.values)
-        report.ticks += 1
+            episode = _Episode()
+        episode.add(values)
         if len(episode.rows) == length:
             yield episode.take()
-    if episode is not None and episode.rows:
+    if episode.rows:
         yield episode.take()
 
 
@@ -171,8 +101,7 @@ class BagStream(Iterator[Stretch]):
         """Return the next stretch.
 
         Raises:
-            BagError: As `open_checked`, if no bag holds a whole tick, or if one holds an episode with a seed that is
-                kept for tests and that is not allowed.
+            BagError: As `open_training_bag` and `episode_ticks`, or if no bag holds a whole tick.
         """
         while True:
             if self._bag == len(self._order):
@@ -183,14 +112,9 @@ class BagStream(Iterator[Stretch]):
                 self._begin_round()
             path = self._paths[self._order[self._bag]]
             if self._reader is None:
-                bag = open_checked(path, skip_damaged=self._skip_damaged)
-                self._reader = stretches(bag, self._length, self._report)
+                bag = open_training_bag(path, TOPICS, skip_damaged=self._skip_damaged)
+                self._reader = stretches(bag, self._length, self._report, allow_test_seeds=self._allow_test_seeds)
             stretch = next(self._reader, None)
-            if self._report.test_seeds and not self._allow_test_seeds:
-                raise BagError(
-                    f"{path} holds an episode with seed {min(self._report.test_seeds)}, which is kept for tests: "
-                    f"expected seeds from {TEST_SEEDS.stop} on, or --allow-test-seeds"
-                )
             if stretch is not None:
                 self._taken += 1
                 return stretch

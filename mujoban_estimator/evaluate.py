@@ -19,12 +19,13 @@ from torch import Tensor
 
 from mujoban_core.interfaces import INSTRUCTION_LIMIT, renew_rows
 from mujoban_estimator import SHIPPED, SHIPPED_TERMINATION, load, load_termination
-from mujoban_estimator.bag_stream import ReadReport, find_bags, open_checked, stretches
+from mujoban_estimator.bag_stream import TOPICS, stretches
 from mujoban_estimator.data import Batch, Batcher, Stretch, choose_windows
 from mujoban_estimator.encoder import FrameEncoder
 from mujoban_estimator.estimator import Belief, StateEstimator, probabilities
 from mujoban_estimator.metrics import MapScores, TerminationScores
 from mujoban_estimator.termination import ControlTermination
+from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
 
 _LENGTH = 480
 _STREAMS = 8
@@ -64,7 +65,8 @@ def evaluate(
 
 def _chain(bags: Sequence[Path], report: ReadReport, skip_damaged: bool) -> Iterator[Stretch]:
     for path in bags:
-        yield from stretches(open_checked(path, skip_damaged=skip_damaged), _LENGTH, report)
+        bag = open_training_bag(path, TOPICS, skip_damaged=skip_damaged)
+        yield from stretches(bag, _LENGTH, report, allow_test_seeds=True)
 
 
 class _Scoring:

@@ -7,16 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_estimator.bag_stream import find_bags
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.bags import open_bag
+from mujoban_msgs_py.bags.training import EpisodeTick, episode_ticks, find_bags, open_training_bag
 from mujoban_planner.abstract_env import STEP_REWARD
 
 _TOPICS = (topics.EPISODE, topics.TRUE_ABSTRACT_STATE, topics.INSTRUCTION, topics.TERMINATION)
@@ -41,9 +40,10 @@ class BagTransitions(NamedTuple):
         """Read the transitions of bags, or of folders of bags.
 
         Raises:
-            ValueError: If a bag is damaged, lacks a topic, or no transition is found.
+            ValueError: If a bag is damaged, lacks a topic or holds a test level, or no transition is found.
         """
-        found = [row for bag in find_bags(bags) for row in transitions(open_bag(bag).ticks(_TOPICS))]
+        opened = [open_training_bag(bag, _TOPICS) for bag in find_bags(bags)]
+        found = [row for bag in opened for row in transitions(episode_ticks(bag, _TOPICS, endings=True))]
         if not found:
             raise ValueError(f"{', '.join(map(str, bags))}: no completed instruction, expected bags of played episodes")
         states, instructions, rewards, successors, terminated = zip(*found, strict=True)
@@ -64,34 +64,36 @@ class BagTransitions(NamedTuple):
 class _Pending(NamedTuple):
     """The instruction in force."""
 
-    episode: int
     sequence: int
     state: NDArray[np.float32]
     instruction: int
 
 
-def transitions(ticks: Iterable[Any]) -> list[tuple[NDArray[np.float32], int, float, NDArray[np.float32], bool]]:
-    """Return (state, instruction, reward, next state, solved) of each instruction that was completed.
+Transition = tuple[NDArray[np.float32], int, float, NDArray[np.float32], bool]
+"""(state, instruction, reward, next state, solved)."""
+
+
+def transitions(ticks: Iterable[EpisodeTick]) -> list[Transition]:
+    """Return a transition for each instruction that was completed.
 
     Args:
-        ticks: Each with values (episode, true abstract state, instruction, termination), as `Bag.ticks` yields them.
+        ticks: With values (episode, true abstract state, instruction, termination), the last two None behind an
+            episode's end, as `episode_ticks` yields them.
     """
-    found = []
+    found: list[Transition] = []
     pending: _Pending | None = None
     reward = 0.0
-    for tick in ticks:
-        episode, state, instruction, termination = tick.values
-        if pending is not None and episode.episode != pending.episode:
+    for episode, (_, state, instruction, termination) in ticks:
+        if episode.step == 0:
             pending = None
         if pending is not None:
             reward += float(episode.reward)
-            solved = bool(episode.solved)
-            issued = instruction.sequence != pending.sequence
-            if (issued or solved) and not termination.timed_out:
-                found.append((pending.state, pending.instruction, reward + STEP_REWARD, state, solved))
-            if issued or solved or episode.truncated:
+            if episode.solved:
+                found.append((pending.state, pending.instruction, reward + STEP_REWARD, state, True))
+            elif instruction is not None and instruction.sequence != pending.sequence:
+                if not termination.timed_out:
+                    found.append((pending.state, pending.instruction, reward + STEP_REWARD, state, False))
                 pending = None
-        if pending is None and not (episode.solved or episode.truncated):
-            pending = _Pending(episode.episode, instruction.sequence, state, instruction.direction)
-            reward = 0.0
+        if pending is None and instruction is not None:
+            pending, reward = _Pending(instruction.sequence, state, instruction.direction), 0.0
     return found

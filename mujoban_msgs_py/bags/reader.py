@@ -130,20 +130,31 @@ class Bag:
         for message in self.messages(names):
             yield Value(message.topic, message.stamp, self._decode(message, self._deserialise(message)))
 
-    def ticks(self, wanted: Sequence[Topic]) -> Iterator[Tick]:
+    def ticks(self, wanted: Sequence[Topic], *, endings: bool = False) -> Iterator[Tick]:
         """Yield the ticks in which every one of these topics said something, by the stamps in the messages.
+
+        Args:
+            wanted: The topics.
+            endings: Yield an episode's last tick as well, which no module answers: what modules say is None there.
+                `topics.EPISODE` must be wanted, since it tells which tick that is.
 
         Raises:
             BagError: As `read`.
         """
         names = [topic.name for topic in wanted]
         join: Synchroniser[Any] = Synchroniser(names, HELD_TICKS)
+        unanswered = [topic.name for topic in wanted if topic in topics.SIMULATOR_TOPICS] if endings else []
+        ending: Synchroniser[Any] | None = Synchroniser(unanswered, HELD_TICKS) if unanswered else None
         for message in self.messages(names):
             content = self._deserialise(message)
-            stamp = conversions.stamp_of(content)
-            complete = join.add(message.topic, stamp, self._decode(message, content))
+            stamp, value = conversions.stamp_of(content), self._decode(message, content)
+            complete = join.add(message.topic, stamp, value)
+            if complete is None and ending is not None and message.topic in unanswered:
+                last = ending.add(message.topic, stamp, value)
+                if last is not None and _is_over(last[topics.EPISODE.name]):
+                    complete = last
             if complete is not None:
-                yield Tick(stamp, tuple(complete[name] for name in names))
+                yield Tick(stamp, tuple(complete.get(name) for name in names))
         join.clear()
         self.incomplete = join.dropped
 
@@ -218,6 +229,10 @@ def _storage(path: Path, damaged: Damage) -> Storage:
     if path.suffix == ".db3":
         return SqliteBag(path)
     raise BagError(f"{path} is not a bag: expected a folder, .mcap or .db3")
+
+
+def _is_over(episode: conversions.EpisodeReading) -> bool:
+    return episode.terminated or episode.truncated
 
 
 def _number(path: Path) -> tuple[int, str]:

@@ -11,7 +11,7 @@ import torch
 
 from bringup.rollout import Ending, Tick
 from bringup.rollout_recorder import Recorder
-from mujoban_controller.bag_sequences import BagSequences, episodes, open_checked, transitions
+from mujoban_controller.bag_sequences import TOPICS, BagSequences, episodes, transitions
 from mujoban_controller.controller import Recurrent, VisuomotorController
 from mujoban_controller.goal_features import privileged_features
 from mujoban_controller.goal_task import GoalTask, GoalTaskConfig, judging_config
@@ -24,6 +24,7 @@ from mujoban_core.interfaces import Observation, TerminationOutput
 from mujoban_core.sense_plan_act import Decision
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
+from mujoban_msgs_py.bags.training import open_training_bag
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
@@ -73,7 +74,7 @@ def recorded(tmp_path_factory):
 
 def test_the_transitions_are_those_of_the_goal_task(recorded):
     path, live = recorded
-    (ticks,) = episodes(open_checked(path / "row000"))
+    (ticks,) = episodes(open_training_bag(path / "row000", TOPICS))
     found = transitions(ticks, CONFIG)
     assert found.keys() - live.keys() == {"first"} and np.flatnonzero(found["first"]).tolist() == [0]
     assert (live["discount"] == 0).sum() == 1 and (live["reward"] > 3.0).sum() >= 2
@@ -116,7 +117,7 @@ def test_a_run_learns_from_bags_as_well(recorded, stage, tmp_path):
 
 
 def test_a_missing_topic_is_named_in_one_line(recorded, tmp_path):
-    bag = open_checked(recorded[0] / "row000")
+    bag = open_training_bag(recorded[0] / "row000", TOPICS)
     kept = [t for t in topics.GRAPH_TOPICS.values() if t.name in bag.topics and t is not topics.TORQUE]
     with BagWriter(tmp_path / "bag", kept) as writer:
         for message in bag.messages([t.name for t in kept]):
@@ -133,7 +134,7 @@ def test_a_missing_topic_is_named_in_one_line(recorded, tmp_path):
 def test_episodes_that_are_kept_for_tests_are_refused(tmp_path):
     play_and_record(tmp_path, 5)
     with pytest.raises(BagError, match="seed 5"):
-        next(episodes(open_checked(tmp_path / "row000")))
+        next(episodes(open_training_bag(tmp_path / "row000", TOPICS)))
 
 
 def test_distillation_refuses_bags(recorded, tmp_path):

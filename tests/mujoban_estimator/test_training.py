@@ -17,7 +17,7 @@ from mujoban_core.interfaces import GroundTruth, Observation, TerminationOutput
 from mujoban_core.plugins import ROLES
 from mujoban_core.sense_plan_act import Decision
 from mujoban_estimator import load, load_termination
-from mujoban_estimator.bag_stream import BagStream, ReadReport, find_bags, open_checked, stretches
+from mujoban_estimator.bag_stream import TOPICS, BagStream, stretches
 from mujoban_estimator.data import Batcher, Stretch, choose_windows
 from mujoban_estimator.estimator import EstimatorConfig
 from mujoban_estimator.learner import EstimatorLearner, LearnerConfig, TrainConfig
@@ -27,6 +27,7 @@ from mujoban_estimator.termination import TerminationConfig
 from mujoban_estimator.train import Options, make_trainer
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
+from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_sokoban.generator import TRAIN_SEEDS
@@ -73,7 +74,7 @@ def bags(tmp_path_factory):
 
 def test_a_bag_gives_back_the_episodes_in_stretches(bags):
     report = ReadReport()
-    found = list(stretches(open_checked(find_bags([bags])[0]), 8, report))
+    found = list(stretches(open_training_bag(find_bags([bags])[0], TOPICS), 8, report))
     assert [len(s.frame) for s in found] == [7, 8, 4]
     assert [s.first for s in found] == [True, True, False]
     assert [int(m) for s in found for m in s.frame[:, 0, 0, 0]] == [*range(7), *range(20, 32)]
@@ -81,14 +82,14 @@ def test_a_bag_gives_back_the_episodes_in_stretches(bags):
 
 
 def test_instruction_and_termination_are_those_of_the_tick_before(bags):
-    first = next(stretches(open_checked(find_bags([bags])[0]), 8, ReadReport()))
+    first = next(stretches(open_training_bag(find_bags([bags])[0], TOPICS), 8, ReadReport()))
     assert first.instruction.tolist() == [Instruction.STAY, 1, 1, 1, 1, 2, 2]
     assert np.flatnonzero(first.terminated).tolist() == [5]
     assert np.flatnonzero(first.completed).tolist() == [3]
 
 
 def test_recorded_bags_hold_every_topic_of_the_graph(bags):
-    bag = open_checked(find_bags([bags])[0])
+    bag = open_training_bag(find_bags([bags])[0], TOPICS)
     assert set(bag.topics) == {t.name for t in RECORDED}
     assert set(topics.GRAPH_TOPICS) - set(bag.topics) == {topics.TOP_CAMERA.name}
     assert bag.topics[topics.EPISODE.name].count == sum(LENGTHS) + len(LENGTHS)
@@ -104,26 +105,26 @@ def copy_without(bag, path, drop):
 
 
 def test_a_missing_topic_is_named(bags, tmp_path):
-    bag = open_checked(find_bags([bags])[0])
+    bag = open_training_bag(find_bags([bags])[0], TOPICS)
     copy_without(bag, tmp_path / "bag", lambda topic, _: topic == topics.TRUE_TERMINATION.name)
     with pytest.raises(BagError, match=topics.TRUE_TERMINATION.name):
-        open_checked(tmp_path / "bag")
+        open_training_bag(tmp_path / "bag", TOPICS)
 
 
 def test_behind_a_missing_tick_an_episode_is_not_used(bags, tmp_path):
-    bag = open_checked(find_bags([bags])[0])
+    bag = open_training_bag(find_bags([bags])[0], TOPICS)
     gone = 3 * topics.TICK
     copy_without(bag, tmp_path / "bag", lambda topic, stamp: topic == topics.CAMERA.name and stamp == gone)
     report = ReadReport()
-    found = list(stretches(open_checked(tmp_path / "bag"), 64, report))
+    found = list(stretches(open_training_bag(tmp_path / "bag", TOPICS), 64, report))
     assert [len(s.frame) for s in found] == [2, 12]
     assert sum(report.skipped.values()) == 4
 
 
 def test_a_bag_that_begins_amid_an_episode_is_used_from_the_next_start(bags, tmp_path):
-    bag = open_checked(find_bags([bags])[0])
+    bag = open_training_bag(find_bags([bags])[0], TOPICS)
     copy_without(bag, tmp_path / "bag", lambda _, stamp: stamp is not None and stamp <= 2 * topics.TICK)
-    found = list(stretches(open_checked(tmp_path / "bag"), 64, ReadReport()))
+    found = list(stretches(open_training_bag(tmp_path / "bag", TOPICS), 64, ReadReport()))
     assert [len(s.frame) for s in found] == [12]
 
 
@@ -263,7 +264,9 @@ def test_the_command_names_a_bad_bag_in_one_line(tmp_path):
 def test_what_is_recorded_can_be_learned_from_and_learning_goes_on_where_it_stopped(tmp_path):
     stack = Stack({role: Choice(role, "oracle") for role in ROLES})
     job = Job(tmp_path / "bags", "", MixedEpisodes(2, SEED, [1]), stack, Disturbance(), 2, 24, 0)
-    assert record(job) == sum(t.count for b in find_bags([job.out]) for t in [open_checked(b).topics["/torque"]])
+    ticks = record(job)
+    bags = [open_training_bag(path, TOPICS) for path in find_bags([job.out])]
+    assert ticks == sum(bag.topics["/torque"].count for bag in bags)
     config = TrainConfig(LearnerConfig(window_frames=8), streams=1, length=8, steps=2)
     options = Options((job.out,), tmp_path / "run", (job.out,), out=tmp_path / "weights", config=config)
     make_trainer(options).run()
@@ -300,7 +303,7 @@ def test_a_batch_with_nan_leaves_both_modules_their_memory_and_the_optimiser_unt
 
 def test_other_bags_may_be_learned_from_in_the_next_bit_of_a_run(bags, make, tmp_path):
     make(tmp_path / "run").run(limit_updates=1)
-    copy_without(open_checked(find_bags([bags])[0]), tmp_path / "other", lambda *_: False)
+    copy_without(open_training_bag(find_bags([bags])[0], TOPICS), tmp_path / "other", lambda *_: False)
     resumed = make(tmp_path / "run", bags=tmp_path / "other")
     resumed.run(limit_updates=2)
     assert resumed.progress.updates == 2

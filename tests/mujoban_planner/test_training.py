@@ -1,13 +1,20 @@
 import json
 import math
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import mujoban_planner
+from bringup.command import Choice, Stack
+from bringup.record import Job, MixedEpisodes, record
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
+from mujoban_core.plugins import ROLES
+from mujoban_msgs_py.bags import BagError
+from mujoban_msgs_py.bags.training import EpisodeTick
+from mujoban_msgs_py.conversions import InstructionReading
 from mujoban_planner import bag_transitions, train
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.decision import count_visits, initial_thoughts, initial_visits
@@ -143,38 +150,47 @@ def test_training_levels_are_training_seeds_and_never_repeat():
     assert stream.next_seed == first + 32 and not torch.equal(a, b)
 
 
-class _Value:
-    def __init__(self, **fields):
-        self.__dict__.update(fields)
-
-
-def _tick(episode, step, reward, sequence, direction=1, *, solved=False, truncated=False, timed_out=False):
+def _tick(step, reward, sequence=None, direction=1, *, solved=False, truncated=False, timed_out=False):
+    """One tick of an episode; without an instruction it is the last one."""
     state = np.full((10, 10, 4), step, np.float32)
-    return _Value(
-        values=(
-            _Value(episode=episode, reward=reward, solved=solved, truncated=truncated),
-            state,
-            _Value(sequence=sequence, direction=direction),
-            _Value(timed_out=timed_out),
-        )
-    )
+    episode = SimpleNamespace(step=step % 10, reward=reward, solved=solved, truncated=truncated)
+    said = None if sequence is None else InstructionReading(sequence, direction)
+    return EpisodeTick(episode, (episode, state, said, said and SimpleNamespace(timed_out=timed_out)))
 
 
 def test_bags_give_completed_instructions_with_their_rewards():
     ticks = [
-        _tick(1, 0, 0.0, 1, 2),
-        _tick(1, 1, 0.0, 1, 2),
-        _tick(1, 2, 1.0, 2, 3),  # instruction 1 done, a box came onto a target
-        _tick(1, 3, 0.0, 3, 4, timed_out=True),  # instruction 2 failed: dropped
-        _tick(1, 4, 11.0, 3, 4, solved=True),
-        _tick(2, 5, 0.0, 1, 1),
-        _tick(2, 6, 0.0, 1, 1, truncated=True),
+        _tick(0, 0.0, 1, 2),
+        _tick(1, 0.0, 1, 2),
+        _tick(2, 1.0, 2, 3),  # instruction 1 done, a box came onto a target
+        _tick(3, 0.0, 3, 4, timed_out=True),  # instruction 2 failed: dropped
+        _tick(4, 11.0, solved=True),
+        _tick(10, 0.0, 1, 1),
+        _tick(11, 0.0, truncated=True),
     ]
     rows = bag_transitions.transitions(ticks)
     assert [(int(s[0, 0, 0]), a, round(r, 2), int(n[0, 0, 0]), done) for s, a, r, n, done in rows] == [
         (0, 2, 0.99, 2, False),
         (3, 4, 10.99, 4, True),
     ]
+
+
+def _record(path, seed):
+    stack = Stack({role: Choice(role, "oracle") for role in ROLES})
+    return record(Job(path, "", MixedEpisodes(1, seed, [1]), stack, None, 1, 400, 0))
+
+
+def test_the_push_that_solves_a_recorded_level_is_a_transition(tmp_path):
+    assert _record(tmp_path, TRAIN_SEEDS.start)
+    found = bag_transitions.BagTransitions.read([tmp_path])
+    assert found.terminated.tolist() == [False] * (len(found.reward) - 1) + [True]
+    assert found.reward[-1] == pytest.approx(11 - 0.01) and (found.reward[:-1] < 2).all()
+
+
+def test_mpo_refuses_bags_with_levels_that_are_kept_for_tests(tmp_path):
+    _record(tmp_path, 5)
+    with pytest.raises(BagError, match="seed 5, which is kept for tests"):
+        bag_transitions.BagTransitions.read([tmp_path])
 
 
 def test_bad_training_input_ends_with_one_line_and_status_2(tmp_path, monkeypatch, capsys):

@@ -1,0 +1,129 @@
+"""The one reader of training episodes: it finds bags, checks them, and never yields a level that is kept for tests.
+
+bags = [open_training_bag(path, wanted) for path in find_bags(folders)]
+for episode, values in episode_ticks(bags[0], wanted):
+    ...
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mujoban_msgs_py import topics
+from mujoban_msgs_py.bags.errors import BagError
+from mujoban_msgs_py.bags.metadata import FILE_NAME
+from mujoban_msgs_py.bags.reader import Bag, open_bag
+from mujoban_msgs_py.conversions import EpisodeReading
+from mujoban_msgs_py.topics import Topic
+from mujoban_sokoban.generator import TRAIN_SEEDS
+
+
+def find_bags(folders: Sequence[Path]) -> list[Path]:
+    """Return the bags among the given paths: each is a bag, or a folder of bags.
+
+    Raises:
+        BagError: If there is none at a path.
+    """
+    found: list[Path] = []
+    for folder in folders:
+        if not folder.exists():
+            raise BagError(f"no bag at {folder}: expected a bag or a folder of bags")
+        if folder.is_file() or (folder / FILE_NAME).exists() or _has_files(folder):
+            found.append(folder)
+            continue
+        below = sorted(p for p in folder.iterdir() if p.is_dir() and ((p / FILE_NAME).exists() or _has_files(p)))
+        if not below:
+            raise BagError(f"no bag in {folder}: expected folders with {FILE_NAME}, .mcap or .db3 files")
+        found += below
+    return found
+
+
+def _has_files(folder: Path) -> bool:
+    return any(folder.glob("*.mcap")) or any(folder.glob("*.db3"))
+
+
+def open_training_bag(path: Path, wanted: Sequence[Topic], *, skip_damaged: bool = False) -> Bag:
+    """Open a bag that has something of every topic wanted.
+
+    Args:
+        path: The bag.
+        wanted: What training needs.
+        skip_damaged: Leave damaged chunks out instead of refusing the bag.
+
+    Raises:
+        BagError: If a topic is missing, by name, or the bag is damaged and that is not to be skipped.
+    """
+    bag = open_bag(path, damaged="skip" if skip_damaged else "refuse")
+    missing = [t.name for t in wanted if t.name not in bag.topics or bag.topics[t.name].count == 0]
+    if missing:
+        raise BagError(f"{path} lacks {', '.join(missing)}: expected a bag with {', '.join(t.name for t in wanted)}")
+    return bag
+
+
+@dataclass
+class ReadReport:
+    """What reading met with."""
+
+    ticks: int = 0
+    episodes: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+    """Ticks that were left out, by reason."""
+
+
+class EpisodeTick(NamedTuple):
+    """A tick of an episode all of whose earlier ticks came before."""
+
+    episode: EpisodeReading
+    """Its `step` is 0 where an episode begins."""
+    values: tuple[Any, ...]
+    """In the order of the topics wanted."""
+
+
+def episode_ticks(
+    bag: Bag,
+    wanted: Sequence[Topic],
+    report: ReadReport | None = None,
+    *,
+    endings: bool = False,
+    allow_test_seeds: bool = False,
+) -> Iterator[EpisodeTick]:
+    """Yield the ticks of each episode of a bag from its first on, up to one that is missing.
+
+    What is behind a missing tick is left out: without it nobody can tell what the modules remember.
+
+    Args:
+        bag: As `open_training_bag` returns it.
+        wanted: Topics, with `topics.EPISODE` among them.
+        report: Counts what is read and left out.
+        endings: Yield an episode's last tick as well, which no module answers: as `Bag.ticks`.
+        allow_test_seeds: Yield episodes with seeds that are kept for tests instead of refusing the bag.
+
+    Raises:
+        BagError: As `Bag.ticks`, or if an episode's seed is not for training.
+    """
+    report = ReadReport() if report is None else report
+    which = wanted.index(topics.EPISODE)
+    number, following = None, 0
+    for tick in bag.ticks(wanted, endings=endings):
+        reading: EpisodeReading = tick.values[which]
+        if reading.seed not in TRAIN_SEEDS and not allow_test_seeds:
+            raise BagError(
+                f"{bag.path} holds an episode with seed {reading.seed}, which is kept for tests: expected seeds from "
+                f"{TRAIN_SEEDS.start} on"
+            )
+        if reading.step == 0:
+            number, following = reading.episode, 0
+            report.episodes += 1
+        if number is None:
+            report.skipped["of an episode whose start is missing"] += 1
+        elif reading.episode != number or reading.step != following:
+            report.skipped["behind a gap"] += 1
+            number = None
+        else:
+            following += 1
+            report.ticks += 1
+            yield EpisodeTick(reading, tick.values)
