@@ -8,13 +8,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mujoban_msgs.msg import Episode
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
-from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
 
@@ -35,7 +34,7 @@ class RecorderNode(Node):
         episodes_per_file: Episodes after which the next file of the bag begins.
 
     Attributes:
-        counts: Messages that were never received, by topic.
+        counts: Messages that were never received, or belong to no tick of the simulator, by topic.
         written: Stamp of the latest tick in the bag [ns].
     """
 
@@ -56,9 +55,7 @@ class RecorderNode(Node):
         self.written = 0
         self._acknowledge = self.create_publisher(RECORDED.type, RECORDED.name, RECORDED.qos)
         for topic in GRAPH_TOPICS.values():
-            self.create_subscription(
-                topic.type, topic.name, self._receiver(topic.name), live_qos(QUEUE_DEPTH), raw=True
-            )
+            listen(self, topic, self._receiver(topic.name), qos=live_qos(QUEUE_DEPTH))
 
     def destroy_node(self) -> None:
         """Write what is left and finish the bag."""
@@ -66,24 +63,19 @@ class RecorderNode(Node):
         self._bag.close()
         super().destroy_node()
 
-    def _receiver(self, name: str) -> Callable[[bytes], None]:
-        def receive(message: bytes) -> None:
-            stamp = raw_stamp(message)
+    def _receiver(self, name: str) -> Callable[[Received], None]:
+        def receive(message: Received) -> None:
+            stamp = message.stamp
             if stamp > self.written:
-                self._ticks.setdefault(stamp, {}).setdefault(name, message)
-                if name == topics.EPISODE.name:
-                    self._note_end(stamp, message)
+                self._ticks.setdefault(stamp, {}).setdefault(name, message.raw)
+                if name == topics.EPISODE.name and (message.content.terminated or message.content.truncated):
+                    self._last_ticks.add(stamp)
                 self._write_if_complete(stamp)
             elif name == topics.EPISODE.name:
                 # The simulator offers a tick again that is in the bag: it has missed our word.
                 self._confirm(stamp)
 
         return receive
-
-    def _note_end(self, stamp: int, message: bytes) -> None:
-        episode = read(message, Episode)
-        if episode.terminated or episode.truncated:
-            self._last_ticks.add(stamp)
 
     def _missing(self, stamp: int) -> list[str]:
         expected = SIMULATOR_TOPICS if stamp in self._last_ticks else (*SIMULATOR_TOPICS, *MODULE_TOPICS)
@@ -96,13 +88,30 @@ class RecorderNode(Node):
             self._write(stamp)
             self._confirm(stamp)
         elif len(self._ticks) > HELD_TICKS:
-            self._write(min(self._ticks))
+            observed = [s for s in self._ticks if self._is_observed(s)]
+            # Those that the simulator has not offered are somebody else's: they are given up first, the oldest first.
+            given_up = [s for s in self._ticks if not self._is_observed(s) and s != stamp]
+            if given_up and len(observed) <= HELD_TICKS:
+                self._forget(given_up[0])
+            elif observed:
+                self._write(min(observed))
+
+    def _is_observed(self, stamp: int) -> bool:
+        """Tell whether all that the simulator says of a tick is there; it says it in one go."""
+        return all(topic.name in self._ticks[stamp] for topic in SIMULATOR_TOPICS)
+
+    def _forget(self, stamp: int) -> None:
+        self.counts.update(f"{name} of no tick" for name in self._ticks.pop(stamp))
+        self._last_ticks.discard(stamp)
 
     def _flush(self, before: int | None) -> None:
-        """Write unfinished ticks up to a stamp, or all."""
+        """Write unfinished ticks of the simulator up to a stamp, or all; forget what belongs to none."""
         for stamp in sorted(self._ticks):
             if before is None or stamp < before:
-                self._write(stamp)
+                if self._is_observed(stamp):
+                    self._write(stamp)
+                else:
+                    self._forget(stamp)
 
     def _write(self, stamp: int) -> None:
         self.counts.update(f"{name} not recorded" for name in self._missing(stamp))

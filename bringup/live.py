@@ -11,6 +11,7 @@ import os
 import socket
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final, NamedTuple
@@ -28,6 +29,8 @@ from bringup.overlay import grid_picture
 from mujoban_core.grid import CHANNELS
 from mujoban_core.grid import Instruction as Direction
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.decoders import checked
+from mujoban_msgs_py.listening import reject
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK, Topic
@@ -80,6 +83,7 @@ class LiveNode(Node):
     def __init__(self, **options: Any) -> None:
         """Open the stream and start listening."""
         super().__init__("live", **options)
+        self.counts: Counter[str] = Counter()
         fixed = ParameterDescriptor(read_only=True)
         save: Any = self.declare_parameter("save", "", fixed).value
         grpc_port: Any = self.declare_parameter("grpc_port", 9876, fixed).value
@@ -122,14 +126,21 @@ class LiveNode(Node):
         self.get_logger().info(f"live view on http://localhost:{web_port}/?url={address.replace('+', '%2B')}")
 
     def _receiver(self, topic: Topic, handle: Callable[[int, Any], None]) -> Callable[[bytes], None]:
-        is_picture = topic.type in (Image, AbstractState)
+        is_picture, check = topic.type in (Image, AbstractState), checked(topic)
 
         def receive(message: bytes) -> None:
-            stamp = raw_stamp(message)
+            at = time.perf_counter()
+            try:
+                stamp = raw_stamp(message)
+                is_shown = not is_picture or self._is_drawn(stamp)
+                content = read(message, topic.type, check) if is_shown else None
+            except ValueError as error:
+                reject(self, topic.name, error)
+                return
             self._stream.set_time("simulated_time", duration=stamp / 1e9)
-            self._log_time(topic, _Received(stamp, time.perf_counter()))
-            if not is_picture or self._is_drawn(stamp):
-                handle(stamp, read(message, topic.type))
+            self._log_time(topic, _Received(stamp, at))
+            if is_shown:
+                handle(stamp, content)
 
         return receive
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from mujoban_msgs.msg import AbstractState, Episode, Instruction, Termination
+from mujoban_msgs.msg import Episode
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.task import Future
@@ -15,7 +16,8 @@ from rclpy.task import Future
 from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.decoders import checked
+from mujoban_msgs_py.listening import PublisherWatch, Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
 
@@ -23,30 +25,30 @@ _WATCHED = (topics.INSTRUCTION, topics.TERMINATION, topics.ABSTRACT_STATE, topic
 
 
 class Watched(NamedTuple):
-    """What the modules said in the latest tick; decoded where it is looked at."""
+    """What the modules said in the latest tick."""
 
-    raw: dict[str, bytes]
-    """Topic name -> message."""
+    values: dict[str, Any]
+    """Topic name -> what the topic's reader made of the message."""
 
     @property
     def instruction(self) -> conversions.InstructionReading:
         """A."""
-        return read(self.raw[topics.INSTRUCTION.name], Instruction, conversions.instruction_from_msg)
+        return self.values[topics.INSTRUCTION.name]
 
     @property
     def termination(self) -> conversions.TerminationReading:
         """Beta."""
-        return read(self.raw[topics.TERMINATION.name], Termination, conversions.termination_from_msg)
+        return self.values[topics.TERMINATION.name]
 
     @property
     def estimate(self) -> NDArray[np.float32]:
         """Estimated abstract state, [N, N, 4]."""
-        return read(self.raw[topics.ABSTRACT_STATE.name], AbstractState, conversions.abstract_state_from_msg)
+        return self.values[topics.ABSTRACT_STATE.name]
 
     @property
     def truth(self) -> NDArray[np.float32]:
         """True abstract state, [N, N, 4]."""
-        return read(self.raw[topics.TRUE_ABSTRACT_STATE.name], AbstractState, conversions.abstract_state_from_msg)
+        return self.values[topics.TRUE_ABSTRACT_STATE.name]
 
 
 class MonitorNode(Node):
@@ -58,6 +60,7 @@ class MonitorNode(Node):
         results: Outcomes so far.
         finished: Done when all episodes have ended.
         ticks: Ticks that the graph has answered.
+        counts: Events that a user should know of.
     """
 
     def __init__(self, episodes: int, **options: Any) -> None:
@@ -68,6 +71,7 @@ class MonitorNode(Node):
         self.results: list[EpisodeResult] = []
         self.finished = Future()
         self.ticks = 0
+        self.counts: Counter[str] = Counter()
         self._episodes = episodes
         self._started = self._ended = 0.0
         self._join = Synchroniser([t.name for t in _WATCHED], depth=64)
@@ -76,9 +80,10 @@ class MonitorNode(Node):
         self._joined = -1
         self._end: Episode | None = None
         qos = live_qos(depth=1024)
-        self.create_subscription(Episode, topics.EPISODE.name, self._on_episode, qos, raw=True)
+        listen(self, topics.EPISODE, self._on_episode, qos=qos, decode=checked(topics.EPISODE))
         for topic in _WATCHED:
-            self.create_subscription(topic.type, topic.name, partial(self._receive, topic.name), qos, raw=True)
+            listen(self, topic, partial(self._receive, topic.name), qos=qos)
+        self.watch = PublisherWatch(self)
 
     @property
     def stamp(self) -> int:
@@ -91,18 +96,22 @@ class MonitorNode(Node):
         seconds = self._ended - self._started
         return self.ticks / seconds if seconds > 0 else 0.0
 
-    def _receive(self, name: str, message: bytes) -> None:
-        stamp = raw_stamp(message)
-        if stamp <= self._joined:
+    def _receive(self, name: str, message: Received) -> None:
+        if message.stamp <= self._joined:
             return
-        joined = self._join.add(name, stamp, message)
+        joined = self._join.add(name, message.stamp, message.content)
         if joined is not None:
-            self._joined = stamp
+            self._joined = message.stamp
             self._on_tick(Watched(joined))
 
-    def _on_episode(self, raw: bytes) -> None:
-        message = read(raw, Episode)
-        if self._end is not None:
+    def _on_episode(self, received: Received) -> None:
+        message: Episode = received.content
+        if self._end is not None and message.episode == self._end.episode:
+            # The episode goes on, so that its end was not the simulator's word.
+            if message.header.stamp != self._end.header.stamp:
+                self._end = None
+                self.counts["contradictory episodes"] += 1
+        elif self._end is not None:
             self._finish()
         self._started = self._started or time.perf_counter()
         if self.episode is None or message.episode != self.episode.episode:

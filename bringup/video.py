@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from rclpy.node import Node
 from bringup.overlay import Said, draw
 from mujoban_core.grid import CONTROL_PERIOD
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
 
@@ -56,6 +58,7 @@ class VideoNode(Node):
             OSError: If its folder does not exist.
         """
         super().__init__("video", **options)
+        self.counts: Counter[str] = Counter()
         if path.suffix != ".mp4":
             raise ValueError(f"{path}: expected a file name that ends in .mp4")
         if not path.absolute().parent.is_dir():
@@ -70,8 +73,7 @@ class VideoNode(Node):
         for handle, parts in ((self._on_seen, _SEEN), (self._on_said, _SAID)):
             join: Synchroniser[Any] = Synchroniser([topic.name for topic in parts])
             for topic, decode in parts.items():
-                receive = self._receiver(join, topic.name, decode, handle)
-                self.create_subscription(topic.type, topic.name, receive, live_qos(256))
+                listen(self, topic, self._receiver(join, topic.name, handle), qos=live_qos(256), decode=decode)
 
     def destroy_node(self) -> None:
         """Finish the file."""
@@ -83,16 +85,14 @@ class VideoNode(Node):
         self,
         join: Synchroniser[Any],
         name: str,
-        decode: Callable[[Any], Any],
         handle: Callable[[int, dict[str, Any]], None],
-    ) -> Callable[[Any], None]:
-        def receive(message: Any) -> None:
-            stamp = conversions.stamp_of(message)
-            if stamp <= self.written:
+    ) -> Callable[[Received], None]:
+        def receive(message: Received) -> None:
+            if message.stamp <= self.written:
                 return
-            parts = join.add(name, stamp, decode(message))
+            parts = join.add(name, message.stamp, message.content)
             if parts is not None:
-                handle(stamp, parts)
+                handle(message.stamp, parts)
                 self._write(PATIENCE)
 
         return receive

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import sys
 from array import array
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Vector3
+from geometry_msgs.msg import Point, Pose, Vector3
 from mujoban_msgs.msg import AbstractState
 from nav_msgs.msg import MapMetaData, OccupancyGrid
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from mujoban_core.grid import CELL_SIZE, CHANNELS, TARGET, WALL, cell_to_xy
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.decoders import checked
+from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 
 PREFIX: Final = "/viz"
@@ -46,6 +49,7 @@ class VizNode(Node):
     def __init__(self, **options: Any) -> None:
         """Start listening."""
         super().__init__("viz", **options)
+        self.counts: Counter[str] = Counter()
         self._pose: Pose | None = None
         self._boxes: list[Pose] = []
         self._grids = {
@@ -54,23 +58,27 @@ class VizNode(Node):
             for name in CHANNELS
         }
         self._scene = self.create_publisher(MarkerArray, f"{PREFIX}/scene", 1)
-        listen = live_qos()
-        self.create_subscription(AbstractState, topics.ABSTRACT_STATE.name, self._on_estimate, listen)
-        self.create_subscription(AbstractState, topics.TRUE_ABSTRACT_STATE.name, self._on_truth, listen)
-        self.create_subscription(PoseStamped, topics.POSE.name, self._on_pose, listen)
-        self.create_subscription(PoseArray, topics.TRUE_BOXES.name, self._on_boxes, listen)
+        for topic, show in (
+            (topics.ABSTRACT_STATE, self._on_estimate),
+            (topics.TRUE_ABSTRACT_STATE, self._on_truth),
+            (topics.POSE, self._on_pose),
+            (topics.TRUE_BOXES, self._on_boxes),
+        ):
+            listen(self, topic, show, qos=live_qos(), decode=checked(topic))
 
-    def _on_pose(self, message: PoseStamped) -> None:
-        self._pose = message.pose
+    def _on_pose(self, message: Received) -> None:
+        self._pose = message.content.pose
 
-    def _on_boxes(self, message: PoseArray) -> None:
-        self._boxes = list(message.poses)
+    def _on_boxes(self, message: Received) -> None:
+        self._boxes = list(message.content.poses)
 
-    def _on_estimate(self, message: AbstractState) -> None:
+    def _on_estimate(self, received: Received) -> None:
+        message: AbstractState = received.content
         if self._is_due(message):
             self._publish_grids("estimate", message.header, conversions.abstract_state_from_msg(message))
 
-    def _on_truth(self, message: AbstractState) -> None:
+    def _on_truth(self, received: Received) -> None:
+        message: AbstractState = received.content
         if self._is_due(message):
             state = conversions.abstract_state_from_msg(message)
             self._publish_grids("ground_truth", message.header, state)

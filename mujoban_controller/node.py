@@ -22,7 +22,7 @@ class ControllerNode(ModuleNode):
     inputs = (
         Input(topics.INSTRUCTION, conversions.instruction_from_msg),
         Input(topics.CAMERA, conversions.frame_from_msg),
-        Input(topics.PROPRIO, conversions.proprio_from_msg),
+        Input(topics.PROPRIO, conversions.body_proprio_from_msg),
         Input(topics.TERMINATION, conversions.termination_from_msg),
     )
 

@@ -183,6 +183,8 @@ def _views(wall: NDArray[np.float32], cells: NDArray[np.int64]) -> NDArray[np.bo
 def _walks(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the walking distance to each cell, [N * N], -1 where none leads, and the first step of the way."""
     free = (abstract_state[..., WALL] < _FREE) & (abstract_state[..., BOX] < _FREE)
+    # A level ends in walls whatever an estimate says, and nobody walks off the grid.
+    free[[0, -1]] = free[:, [0, -1]] = False
     distance, first = np.full(_CELLS, -1), np.full(_CELLS, int(Instruction.STAY))
     start = int(np.argmax(abstract_state[..., AGENT]))
     distance[start], queue = 0, [start]
@@ -190,7 +192,7 @@ def _walks(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDAr
         for instruction in list(Instruction)[1:]:
             row, column = np.array(divmod(cell, GRID_SIZE)) + OFFSETS_RC[instruction]
             beside = int(row * GRID_SIZE + column)
-            if free[row, column] and distance[beside] < 0:
+            if 0 <= row < GRID_SIZE and 0 <= column < GRID_SIZE and free[row, column] and distance[beside] < 0:
                 distance[beside] = distance[cell] + 1
                 first[beside] = instruction if cell == start else first[cell]
                 queue.append(beside)

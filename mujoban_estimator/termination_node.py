@@ -10,16 +10,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from mujoban_msgs.msg import Episode, Instruction
+from mujoban_msgs.msg import Episode
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
 from mujoban_core.interfaces import NO_INSTRUCTION, GroundTruth, TerminationInput
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 
+REMEMBERED = 64
+"""Instructions kept while it is not known which tick they precede: those of other ticks may come in between."""
 _SETTINGS = ("sample", "threshold", "limit")
 
 
@@ -35,7 +37,7 @@ class TerminationNode(ModuleNode):
     role = "termination"
     inputs = (
         Input(topics.CAMERA, conversions.frame_from_msg),
-        Input(topics.PROPRIO, conversions.proprio_from_msg),
+        Input(topics.PROPRIO, conversions.body_proprio_from_msg),
     )
 
     def __init__(self, **options: Any) -> None:
@@ -46,8 +48,7 @@ class TerminationNode(ModuleNode):
         self._said: dict[int, conversions.InstructionReading] = {}
         for name in _SETTINGS:
             setattr(self.module, name, self.declare_parameter(name, getattr(self.module, name)).value)
-        topic = topics.INSTRUCTION
-        self.create_subscription(topic.type, topic.name, self._on_instruction, topic.qos, raw=True)
+        listen(self, topics.INSTRUCTION, self._on_instruction)
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
         """Start the state and forget the instructions of the episode before."""
@@ -86,18 +87,16 @@ class TerminationNode(ModuleNode):
         return [Output(self._publisher, message)]
 
     def _previous(self, stamp: int) -> conversions.InstructionReading | None:
-        """Return the latest instruction before a stamp."""
+        """Return the instruction of the tick before a stamp, or the latest that is known."""
+        if stamp - topics.TICK in self._said:
+            return self._said[stamp - topics.TICK]
         earlier = [s for s in self._said if s < stamp]
         return self._said[max(earlier)] if earlier else None
 
-    def _on_instruction(self, message: bytes) -> None:
-        stamp = raw_stamp(message)
-        try:
-            said = read(message, Instruction, conversions.instruction_from_msg)
-        except ValueError as error:
-            self.reject("rejected messages", f"rejected a message on {topics.INSTRUCTION.name}: {error}")
-            return
-        self._said = {s: m for s, m in self._said.items() if stamp - 2 * topics.TICK <= s < stamp} | {stamp: said}
+    def _on_instruction(self, message: Received) -> None:
+        self._said[message.stamp] = message.content
+        if len(self._said) > REMEMBERED:
+            del self._said[next(iter(self._said))]
         self.retry()
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:

@@ -24,8 +24,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import Header
 
+from mujoban_core.bodies import BODIES
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.grid import CHANNELS, GRID_SIZE
+from mujoban_core.grid import CHANNELS, DIFFICULTIES, GRID_SIZE
 from mujoban_core.grid import Instruction as Direction
 
 ENCODING: Final = "rgb8"
@@ -146,6 +147,14 @@ def proprio_from_msg(message: Any) -> NDArray[np.float32]:
     axis = message.world_z_axis
     values += [*message.position, *message.velocity, axis.x, axis.y, axis.z]
     return _finite("proprioception", values, (12 + 2 * count,), np.float32)
+
+
+def body_proprio_from_msg(message: Any) -> NDArray[np.float32]:
+    """Return o_pr, [P], of one of `mujoban_core.bodies.BODIES`."""
+    if tuple(message.name) not in {body.joints for body in BODIES.values()}:
+        known = "; ".join(f"{', '.join(body.joints)} ({name})" for name, body in BODIES.items())
+        raise ConversionError(f"joints must be those of a body, {known}, got {', '.join(message.name)[:80]!r}")
+    return proprio_from_msg(message)
 
 
 def pose_to_msg(header: Header, pose: ArrayLike) -> PoseStamped:
@@ -279,7 +288,7 @@ def boxes_to_msg(header: Header, position: ArrayLike) -> PoseArray:
 
 def boxes_from_msg(message: Any) -> NDArray[np.float32]:
     """Return o_box, box centres in the map frame [m], [K, 2]."""
-    centres = np.array([(p.position.x, p.position.y) for p in message.poses], np.float32).reshape(-1, 2)
+    centres = np.array([(p.position.x, p.position.y) for p in message.poses], np.float64).reshape(-1, 2)
     return _finite("box positions", centres, (None, 2), np.float32)
 
 
@@ -320,7 +329,11 @@ def episode_to_msg(header: Header, reading: EpisodeReading) -> Episode:
 
 def episode_from_msg(message: Any) -> EpisodeReading:
     """Return the state of an episode."""
-    return EpisodeReading(*(getattr(message, name) for name in EpisodeReading._fields))
+    reading = EpisodeReading(*(getattr(message, name) for name in EpisodeReading._fields))
+    _finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float64)
+    if reading.difficulty not in (0, *DIFFICULTIES):
+        raise ConversionError(f"difficulty must be 0 or one of {sorted(DIFFICULTIES)}, got {reading.difficulty}")
+    return reading
 
 
 # Checks
@@ -328,7 +341,9 @@ def episode_from_msg(message: Any) -> EpisodeReading:
 
 def _finite(what: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
     """Return values as an array after a check of shape (None: any length) and finiteness."""
-    result = np.asarray(values, dtype)
+    with np.errstate(over="ignore"):
+        # What has no place in the type becomes infinite, which is refused below.
+        result = np.asarray(values, dtype)
     if len(result.shape) != len(shape) or any(
         want not in (None, have) for want, have in zip(shape, result.shape, strict=True)
     ):

@@ -16,6 +16,7 @@ from rclpy.serialization import deserialize_message
 _LITTLE_ENDIAN = 1
 _ENCAPSULATION = 4
 """Bytes before the first field of a message in CDR."""
+_SECOND = 1_000_000_000
 _REMEMBERED = 64
 """Messages of about four ticks."""
 
@@ -24,13 +25,15 @@ def raw_stamp(message: bytes) -> int:
     """Return the stamp [ns] of a serialised message whose first field is a header or a time.
 
     Raises:
-        ValueError: If the message is too short to hold one.
+        ValueError: If the message is too short to hold one, or what it holds is no simulated time.
     """
     if len(message) < _ENCAPSULATION + 8:
         raise ValueError(f"a serialised message of {len(message)} bytes holds no stamp")
     order = "<" if message[1] & _LITTLE_ENDIAN else ">"
     second, nanosecond = struct.unpack_from(order + "iI", message, _ENCAPSULATION)
-    return second * 1_000_000_000 + nanosecond
+    if second < 0 or nanosecond >= _SECOND:
+        raise ValueError(f"a stamp of {second} s and {nanosecond} ns is no simulated time")
+    return second * _SECOND + nanosecond
 
 
 @lru_cache(maxsize=_REMEMBERED)
@@ -41,6 +44,13 @@ def read(message: bytes, kind: type[Any], decode: Callable[[Any], Any] | None = 
         message: CDR, as raw subscriptions deliver it.
         kind: Type of the message.
         decode: Applied to the message, if given; what it raises passes through.
+
+    Raises:
+        ValueError: If the bytes are not a message of this type.
     """
-    content = deserialize_message(message, kind)
+    try:
+        content = deserialize_message(message, kind)
+    except RuntimeError:
+        name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
+        raise ValueError(f"its {len(message)} bytes are no serialised {name}") from None
     return content if decode is None else decode(content)

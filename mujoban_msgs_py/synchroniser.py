@@ -13,8 +13,9 @@ class Synchroniser(Generic[Item]):
     """Joins items of several topics by equal stamp, with bounded memory.
 
     Topics are ordered, so a tick that is completed shows that older ones never will be: they are dropped, as is
-    the oldest of more than `depth` unfinished ticks. Age is that of arrival, so that time may jump back, as
-    when a bag is played again.
+    one of more than `depth` unfinished ticks: the one with the fewest items, which is none of the simulator's when
+    somebody floods a topic, and of these the oldest. Age is that of arrival, so that time may jump back, as when a bag
+    is played again.
 
     Attributes:
         dropped: Items that were received and never handed over, counted by topic.
@@ -55,16 +56,17 @@ class Synchroniser(Generic[Item]):
         items[topic] = item
         if len(items) < len(self.topics):
             if len(self._unfinished) > self.depth:
-                self._drop_oldest()
+                others = [other for other in self._unfinished if other != stamp]
+                self._drop(min(others, key=lambda other: len(self._unfinished[other])))
             return None
-        while next(iter(self._unfinished)) != stamp:
-            self._drop_oldest()
+        while (oldest := next(iter(self._unfinished))) != stamp:
+            self._drop(oldest)
         return self._unfinished.pop(stamp)
 
     def clear(self) -> None:
         """Drop all unfinished ticks, and count them."""
         while self._unfinished:
-            self._drop_oldest()
+            self._drop(next(iter(self._unfinished)))
 
-    def _drop_oldest(self) -> None:
-        self.dropped.update(self._unfinished.pop(next(iter(self._unfinished))).keys())
+    def _drop(self, stamp: Hashable) -> None:
+        self.dropped.update(self._unfinished.pop(stamp).keys())

@@ -103,3 +103,12 @@ MODULE_TOPICS: Final = (ABSTRACT_STATE, TERMINATION, INSTRUCTION, TORQUE)
 """What the four modules publish, in the order of a tick."""
 GRAPH_TOPICS: Final = {topic.name: topic for topic in (*SIMULATOR_TOPICS, *MODULE_TOPICS)}
 """Every topic worth recording, by name."""
+PUBLISHERS: Final = {
+    **{topic.name: "simulator" for topic in SIMULATOR_TOPICS},
+    ABSTRACT_STATE.name: "estimator",
+    TERMINATION.name: "termination",
+    INSTRUCTION.name: "planner",
+    TORQUE.name: "controller",
+    RECORDED.name: "recorder",
+}
+"""Topic -> name of the node that alone publishes on it."""

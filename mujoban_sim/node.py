@@ -11,19 +11,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from mujoban_msgs.msg import Instruction
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.raw import raw_stamp, read
-from mujoban_msgs_py.runtime.tick_node import LOG_PERIOD, live_qos, run_node
+from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
+from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.observation import ObservationPublisher
 from mujoban_sim.rendering import RenderingError
@@ -146,11 +144,11 @@ class SimulatorNode(Node):
         )
 
     def _listen(self) -> None:
-        self.create_subscription(JointState, topics.TORQUE.name, self._on_torque, topics.TORQUE.qos, raw=True)
+        listen(self, topics.TORQUE, self._on_torque, decode=self._read_torque)
         # What a planner said before this simulator came must not arrive.
-        self.create_subscription(Instruction, topics.INSTRUCTION.name, self._on_instruction, live_qos(), raw=True)
+        listen(self, topics.INSTRUCTION, self._on_instruction, qos=live_qos())
         if self._settings["await_recorder"]:
-            self.create_subscription(Header, topics.RECORDED.name, self._on_recorded, topics.RECORDED.qos)
+            listen(self, topics.RECORDED, self._on_recorded)
         self.create_service(Trigger, "/reset", self._on_reset)
         self.create_service(SetBool, "/pause", self._on_pause)
         self.create_service(Trigger, "/step", self._on_step)
@@ -268,36 +266,32 @@ class SimulatorNode(Node):
 
     # Answers
 
-    def _on_torque(self, message: bytes) -> None:
-        stamp = raw_stamp(message)
-        if not self._is_known(stamp, topics.TORQUE.name):
-            return
+    def _read_torque(self, message: JointState) -> NDArray[np.float32]:
+        """Return the torque of a message; of a controller that says nonsense, zero."""
         try:
-            torque = conversions.torque_from_msg(read(message, JointState), self.world.body.action_size)
+            return conversions.torque_from_msg(message, self.world.body.action_size)
         except ValueError as error:
             self._reject("rejected torques", f"rejected a torque, zero is held instead: {error}")
-            torque = np.zeros_like(self._held_torque)
-        if stamp == self._stamp:
-            self._torque = torque
+            return np.zeros_like(self._held_torque)
+
+    def _on_torque(self, message: Received) -> None:
+        if not self._is_known(message.stamp, topics.TORQUE.name):
+            return
+        if message.stamp == self._stamp:
+            self._torque = message.content
             self._proceed()
         elif self._speed > 0 and self._torque is None:
-            self._held_torque = torque
+            self._held_torque = message.content
 
-    def _on_instruction(self, message: bytes) -> None:
-        stamp = raw_stamp(message)
-        if not self._is_known(stamp, topics.INSTRUCTION.name):
+    def _on_instruction(self, message: Received) -> None:
+        if not self._is_known(message.stamp, topics.INSTRUCTION.name):
             return
-        try:
-            instruction = read(message, Instruction, conversions.instruction_from_msg)
-        except ValueError as error:
-            self._reject("rejected instructions", f"rejected an instruction: {error}")
-            return
-        if stamp == self._stamp or (self._speed > 0 and self._instruction is None):
-            self._instruction = instruction
+        if message.stamp == self._stamp or (self._speed > 0 and self._instruction is None):
+            self._instruction = message.content
             self._proceed()
 
-    def _on_recorded(self, message: Header) -> None:
-        if conversions.stamp_of(message) == self._stamp:
+    def _on_recorded(self, message: Received) -> None:
+        if message.stamp == self._stamp:
             self._recorded = True
             self._proceed()
 

@@ -28,6 +28,8 @@ from mujoban_sim.goals import GoalKind, GoalTracker
 from mujoban_sokoban.rules import apply
 from mujoban_sokoban.solver import MAX_NODES, Status, solve
 
+_ABSENT: Final = 1000.0
+"""Where in the map boxes lie that are not there [m]."""
 _MAX_PLAN: Final = 1024
 """Moves of a plan that are remembered; the rest of a longer one is found again when they are done."""
 _WEIGHTS: Final = (1.0, 2.0)
@@ -192,6 +194,8 @@ class OracleController(Controller):
         truth = _require(inputs.truth)
         goals = GoalTracker(len(inputs.instruction), cell_size=BALL.cell_size)
         goals.restore(state)
+        boxes = int(goals.box_index.max(initial=0)) + 1
+        truth = truth._replace(box_position=_with_absent(truth.box_position, boxes))
         goals.reached[:] = truth.completed
         issued = np.flatnonzero(inputs.terminated | (goals.kind == GoalKind.NONE))
         if issued.size:
@@ -245,6 +249,15 @@ def drive(goals: GoalTracker, truth: GroundTruth, gains: DrivingGains) -> NDArra
     roll = g.roll_feed_forward * speed + g.roll_gain * (speed - forward_speed)
     steer = g.steer_gain * error - g.steer_damping * velocity[:, 2]
     return np.clip(np.stack([roll, steer], -1), -1.0, 1.0).astype(np.float32)
+
+
+def _with_absent(box_position: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+    """Return box centres, [B, K, 2], of at least `count` boxes, none of them further out than `_ABSENT`.
+
+    In the graph a box that is being pushed may be missing from what somebody says of the boxes.
+    """
+    missing = max(0, count - box_position.shape[1])
+    return np.pad(box_position.clip(-_ABSENT, _ABSENT), ((0, 0), (0, missing), (0, 0)), constant_values=_ABSENT)
 
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py import conversions
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.metadata import FILE_NAME, Metadata
 from mujoban_msgs_py.bags.storage import Damage, McapFile, RawMessage, SqliteBag, Storage, TopicInfo
 from mujoban_msgs_py.bags.types import TypeRegistry
+from mujoban_msgs_py.decoders import DECODERS
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import Topic
 
@@ -22,25 +23,7 @@ BagMessage = RawMessage
 HELD_TICKS: Final = 64
 """Unfinished ticks kept while ticks are put together: in real time late answers come behind newer observations."""
 
-_DECODERS: Final[dict[Topic, Callable[[Any], Any]]] = {
-    topics.CLOCK: conversions.stamp_of,
-    topics.EPISODE: conversions.episode_from_msg,
-    topics.CAMERA: conversions.frame_from_msg,
-    topics.CAMERA_INFO: conversions.camera_info_from_msg,
-    topics.PROPRIO: conversions.proprio_from_msg,
-    topics.POSE: conversions.pose_from_msg,
-    topics.ABSTRACT_STATE: conversions.abstract_state_from_msg,
-    topics.TERMINATION: conversions.termination_from_msg,
-    topics.INSTRUCTION: conversions.instruction_from_msg,
-    topics.TORQUE: conversions.torque_from_msg,
-    topics.TRUE_ABSTRACT_STATE: conversions.abstract_state_from_msg,
-    topics.TRUE_POSE: conversions.pose_from_msg,
-    topics.TRUE_TWIST: conversions.twist_from_msg,
-    topics.TRUE_BOXES: conversions.boxes_from_msg,
-    topics.TRUE_TERMINATION: conversions.termination_from_msg,
-    topics.TOP_CAMERA: lambda message: conversions.frame_from_msg(message, None),
-}
-_DECODER_BY_NAME: Final = {topic.name: (topic, decode) for topic, decode in _DECODERS.items()}
+_DECODER_BY_NAME: Final = {topic.name: (topic, decode) for topic, decode in DECODERS.items()}
 
 
 class Value(NamedTuple):

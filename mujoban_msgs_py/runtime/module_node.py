@@ -78,7 +78,6 @@ class ModuleNode(TickNode):
     def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
         """Step the module; an episode's last tick needs no answer."""
         if episode.terminated or episode.truncated:
-            self.state = None
             return ()
         if self.state is None or episode.episode != self._episode:
             self._episode = episode.episode

@@ -28,12 +28,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
+from mujoban_msgs_py.decoders import checked
+from mujoban_msgs_py.listening import LOG_PERIOD, reject
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import EPISODE, Topic
 
-LOG_PERIOD = 5.0
-"""Seconds between two reports of bad input from one place."""
 SIGNAL_PERIOD = 0.2
 """Seconds within which a node heeds a signal."""
 PATIENCE = 2
@@ -93,7 +93,7 @@ class TickNode(Node):
 
     def open_inputs(self, inputs: Sequence[Input]) -> None:
         """Subscribe to `/episode` and to what `answer` needs besides."""
-        every = [Input(EPISODE, None), *inputs]
+        every = [Input(EPISODE, checked(EPISODE)), *inputs]
         self._join = Synchroniser([i.topic.name for i in every])
         for topic, decode in every:
             receive = partial(self._receive, topic, decode)
@@ -115,21 +115,16 @@ class TickNode(Node):
         self._open, self._handled, self._outputs = None, stamp, outputs
         self._publish()
 
-    def reject(self, kind: str, reason: str) -> None:
-        """Count bad input and report it, at most once per `LOG_PERIOD`."""
-        self.counts[kind] += 1
-        self.get_logger().error(reason, throttle_duration_sec=LOG_PERIOD)
-
     def _receive(self, topic: Topic, decode: Callable[[Any], Any] | None, message: bytes) -> None:
         if self._destroyed:
             return
-        stamp = raw_stamp(message)
-        if stamp <= self._handled and topic is not EPISODE:
-            return
         try:
+            stamp = raw_stamp(message)
+            if stamp <= self._handled and topic is not EPISODE:
+                return
             item = read(message, topic.type, decode)
         except ValueError as error:
-            self.reject("rejected messages", f"rejected a message on {topic.name}: {error}")
+            reject(self, topic.name, error)
             return
         if topic is EPISODE:
             self._note_offer(stamp, item)
@@ -144,11 +139,21 @@ class TickNode(Node):
             self.retry()
 
     def _note_offer(self, stamp: int, episode: Episode) -> None:
-        if stamp == self._handled:
+        ended = episode.terminated or episode.truncated
+        if stamp == self._handled and (self._outputs or ended):
             self._publish()
+        elif stamp == self._handled:
+            # It was answered as an end, with nothing: that end was not the simulator's word.
+            self.get_logger().error(
+                f"{EPISODE.name} contradicts itself at {stamp} ns: two simulators?", throttle_duration_sec=LOG_PERIOD
+            )
+            self.counts["contradictory episodes"] += 1
+            self._handled = stamp - 1
         elif stamp < self._handled and episode.step == 0:
             # Time has jumped back: another simulator, or a bag that is played from its start.
-            self.get_logger().warning("simulated time jumped back: starting anew")
+            self.get_logger().warning(
+                "simulated time jumped back: starting anew", throttle_duration_sec=LOG_PERIOD
+            )
             self._handled, self._open = -1, None
         elif self._open is not None and stamp == self._open[0]:
             self._offers += 1

@@ -1,0 +1,132 @@
+"""Listen to a topic without trusting those who publish there.
+
+A graph is open: whoever shares its domain can publish on its topics. A message that is not what its topic carries is
+dropped, counted and named by its topic; what passes is sound, but may still come from somebody who does not belong to
+the graph: `foreign_publishers` names them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.logging import get_logger
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+from mujoban_msgs_py.decoders import DECODERS, Decode
+from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.topics import PUBLISHERS, Topic
+
+LOG_PERIOD: Final = 5.0
+"""Seconds between two reports of bad input on one topic."""
+WATCH_PERIOD: Final = 1.0
+"""Seconds between two looks at who publishes."""
+REJECTED: Final = "rejected messages"
+"""Kind under which `Listener.counts` has what was dropped."""
+
+
+class Received(NamedTuple):
+    """A message that is what its topic carries."""
+
+    stamp: int
+    """Of the tick [ns of simulated time]."""
+    content: Any
+    """What the reader of the topic made of it."""
+    raw: bytes
+    """CDR."""
+
+
+def listen(
+    node: Node,
+    topic: Topic,
+    receive: Callable[[Received], None],
+    *,
+    qos: QoSProfile | None = None,
+    decode: Decode | None = None,
+) -> Subscription:
+    """Subscribe to a topic of the graph.
+
+    Args:
+        node: Who listens; if it has `counts`, what is dropped is counted there under `REJECTED`.
+        topic: The topic.
+        receive: Called with every message that is sound.
+        qos: The topic's own by default.
+        decode: Reads a message, in place of the topic's reader; a ValueError drops it.
+    """
+    reader = DECODERS[topic] if decode is None else decode
+
+    def on_message(message: bytes) -> None:
+        try:
+            received = Received(raw_stamp(message), read(message, topic.type, reader), message)
+        except ValueError as error:
+            reject(node, topic.name, error)
+            return
+        receive(received)
+
+    return node.create_subscription(topic.type, topic.name, on_message, qos or topic.qos, raw=True)
+
+
+def reject(node: Node, topic: str, reason: object) -> None:
+    """Count a message that is dropped and name its topic, at most once per `LOG_PERIOD`."""
+    _count(node, REJECTED)
+    text = " ".join(str(reason).split())
+    logger = _logger(f"{node.get_logger().name}.{topic.strip('/').replace('/', '.')}")
+    logger.error(f"rejected a message on {topic}: {text}", throttle_duration_sec=LOG_PERIOD)
+
+
+@cache
+def _logger(name: str) -> RcutilsLogger:
+    """Return a logger of its own for a node and topic: what is throttled is what one logger says."""
+    return get_logger(name)
+
+
+def _count(node: Node, kind: str) -> None:
+    counts: Counter[str] | None = getattr(node, "counts", None)
+    if counts is not None:
+        counts[kind] += 1
+
+
+def foreign_publishers(node: Node, topics: Iterable[str] = PUBLISHERS) -> set[tuple[str, str]]:
+    """Return (topic, node) of every publisher that has no business on a topic of the graph.
+
+    Args:
+        node: Any node of the domain.
+        topics: Names of topics of the graph.
+    """
+    return {
+        (topic, f"{info.node_namespace.rstrip('/')}/{info.node_name}")
+        for topic in topics
+        for info in node.get_publishers_info_by_topic(topic)
+        if (info.node_namespace, info.node_name) != ("/", PUBLISHERS[topic])
+    }
+
+
+class PublisherWatch:
+    """Names those who publish on a graph's topics and do not belong to it, once each.
+
+    Attributes:
+        seen: (topic, node) of all that were named.
+    """
+
+    def __init__(self, node: Node) -> None:
+        """Look on behalf of a node, every `WATCH_PERIOD` seconds."""
+        self._node = node
+        self.seen: set[tuple[str, str]] = set()
+        node.create_timer(WATCH_PERIOD, self.look)
+
+    def look(self) -> None:
+        """Report who has come since the last look."""
+        new = foreign_publishers(self._node) - self.seen
+        self.seen |= new
+        for name in sorted({name for _, name in new}):
+            _count(self._node, "foreign publishers")
+            their = ", ".join(sorted(f"{topic} (of /{PUBLISHERS[topic]})" for topic, n in new if n == name))
+            self._node.get_logger().error(
+                f"foreign publisher: node {name} publishes on {their}; the run may be disturbed. Stop it, or give it "
+                "another ROS_DOMAIN_ID"
+            )

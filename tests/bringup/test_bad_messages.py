@@ -1,0 +1,99 @@
+"""Whatever anybody publishes on the graph's topics, the episode goes on, and the stranger is named."""
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
+
+from benchmarks.malformed import TARGETS, Vandal
+from bringup.graph_recorder import RecorderNode
+from bringup.viz import VizNode
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.bags import open_bag
+from mujoban_sokoban.episodes import Episodes
+
+
+@pytest.mark.parametrize("realtime", [0.0, 8.0])
+def test_spoiled_messages_on_every_topic_end_nothing_and_what_is_recorded_is_sound(play_graph, tmp_path, realtime):
+    graph = play_graph(
+        episodes=Episodes(2, 0, difficulty=1), await_recorder=realtime == 0, time_limit=100, realtime=realtime
+    )
+    path = Parameter("path", value=str(tmp_path / "bag"))
+    recorder = graph.graph.add(RecorderNode(parameter_overrides=[path]))
+    viz = graph.graph.add(VizNode())
+    vandal = graph.graph.add(Vandal(np.random.default_rng(0)))
+    graph.spin_until(lambda: graph.simulator.ticks >= 5)
+    while not graph.monitor.finished.done() and vandal.sent["/clock"] < 400:
+        vandal.act(4)
+        before = graph.simulator.ticks
+        graph.spin_until(lambda b=before: graph.simulator.ticks > b or graph.monitor.finished.done(), timeout=20.0)
+    assert graph.finish()
+    for node in (recorder, viz, *graph.graph.nodes.values()):
+        assert node.counts["rejected messages"] >= 3, node.get_name()
+    graph.graph.executor.remove_node(recorder)
+    graph.graph._others.remove(recorder)
+    recorder.destroy_node()
+    assert sum(1 for _ in open_bag(tmp_path / "bag").read()) > 100, "every recorded message can be read"
+
+
+@pytest.fixture
+def stranger():
+    """A node of another participant, as of another process."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    yield rclpy.create_node("stranger", context=context)
+    context.try_shutdown()
+
+
+def test_a_stranger_on_a_topic_of_the_graph_is_named_also_with_a_foreign_type(play_graph, stranger):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
+    stranger.create_publisher(String, topics.POSE.name, 1)
+    stranger.create_publisher(topics.TORQUE.type, topics.TORQUE.name, 1)
+    expected = {(topics.POSE.name, "/stranger"), (topics.TORQUE.name, "/stranger")}
+    graph.spin_until(lambda: graph.monitor.watch.seen == expected)
+    assert graph.monitor.counts["foreign publishers"] >= 1
+    assert graph.finish()[0].solved
+
+
+def test_an_end_that_the_simulator_did_not_announce_is_taken_back_when_the_tick_is_offered_again(play_graph):
+    graph = play_graph(names=["planner"])
+    tap, header = graph.tap, conversions.header(3 * topics.TICK)
+    mouths = {
+        t: tap.create_publisher(t.type, t.name, t.qos)
+        for t in (topics.EPISODE, topics.ABSTRACT_STATE, topics.TERMINATION)
+    }
+    graph.spin_until(lambda: all(mouth.get_subscription_count() for mouth in mouths.values()))
+    state = conversions.abstract_state_to_msg(header, np.zeros((10, 10, 4), np.float32))
+    planner = graph.graph.nodes["planner"]
+
+    def offer(*, terminated):
+        reading = conversions.EpisodeReading(1, 0, 5, "", 2, 0.0, 0.0, terminated, terminated, False, 0)
+        mouths[topics.EPISODE].publish(conversions.episode_to_msg(header, reading))
+        mouths[topics.ABSTRACT_STATE].publish(state)
+        mouths[topics.TERMINATION].publish(conversions.termination_to_msg(header, 0, 0.0, False))
+
+    offer(terminated=True)
+    graph.spin_until(lambda: planner._handled == 3 * topics.TICK)
+    assert not graph.said.instruction
+    offer(terminated=False)
+    graph.spin_until(lambda: graph.said.instruction)
+    assert planner.counts["contradictory episodes"] == 1
+
+
+def test_messages_that_are_no_messages_are_named_by_topic(play_graph, capfd):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
+    publisher = graph.tap.create_publisher(topics.INSTRUCTION.type, topics.INSTRUCTION.name, topics.INSTRUCTION.qos)
+    listeners = 5  # simulator, termination, controller, monitor and the test's tap
+    graph.spin_until(lambda: graph.simulator.ticks >= 2 and publisher.get_subscription_count() == listeners)
+    nobody = conversions.instruction_to_msg(conversions.header(max(graph.said.instruction)), 1, 1)
+    nobody.direction = 9
+    publisher.publish(nobody)
+    publisher.publish(b"\x00\x01\x00\x00short")
+    graph.spin_until(lambda: graph.monitor.counts["rejected messages"] == 2)
+    assert graph.finish()[0].solved
+    assert "rejected a message on /instruction: direction must be one of 0 (STAY)" in capfd.readouterr().err
+
+
+def test_every_topic_is_attacked():
+    assert {topic.name for topic in TARGETS} == {*topics.GRAPH_TOPICS, topics.RECORDED.name}
