@@ -1,4 +1,4 @@
-# make setup  .venv with everything in it          make lint   ruff and pyright
+# make setup  .venv with everything in it          make lint   ruff, pyright and import rules
 # make run    one episode with a live view         make bench  measurements, as JSON
 # make results  the tables and figures of the paper
 # make test   the test suite
@@ -30,6 +30,7 @@ test: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/pyright
+	$(BIN)/lint-imports
 
 results: $(STAMP)
 	$(BIN)/python -m benchmarks.paper

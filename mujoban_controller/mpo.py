@@ -32,7 +32,7 @@ Policy = PrivilegedPolicy | VisuomotorController
 
 @dataclass(frozen=True)
 class MPOTrainingConfig:
-    """Settings of MPO in the goal task; those of DESIGN, which Acme uses too."""
+    """Settings of MPO in the goal task; those of Acme (Hoffman et al. 2020)."""
 
     length: int = 16
     """T, ticks of a sequence."""
