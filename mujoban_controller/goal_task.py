@@ -32,6 +32,7 @@ from mujoban_controller.instructions import (
 from mujoban_core.grid import COMPLETION_TOLERANCE, DIFFICULTIES, INSTRUCTION_LIMIT, Instruction
 from mujoban_core.interfaces import ControllerInput, Planner, put_rows, take_rows
 from mujoban_sim.goals import GoalKind
+from mujoban_sim.presets import DEFAULT_WORLD, get_world
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.levels import LevelError
@@ -49,6 +50,8 @@ class GoalTaskConfig:
     batch: int = 64
     """B, robots."""
     body: str = "ball"
+    world: str = DEFAULT_WORLD
+    """The physical world: reference or eased."""
     difficulty: int = 5
     tolerance: float = 0.08
     """Completion tolerance in cells; tighter than the paper's 0.1, so that evaluation leaves a margin."""
@@ -80,6 +83,7 @@ class GoalTaskConfig:
 
     def __post_init__(self) -> None:
         """Reject settings that contradict each other."""
+        get_world(self.world)
         if not self.horizon > 0:
             raise ValueError(f"horizon {self.horizon}: expected a positive number of steps")
         if not 0.0 <= self.retry <= 1.0:
@@ -90,7 +94,9 @@ class GoalTaskConfig:
             raise ValueError(f"tolerance {self.tolerance}: expected at most the evaluation's {COMPLETION_TOLERANCE}")
 
 
-def judging_config(batch: int, body: str = "ball", difficulty: int = 5, *, plans: bool = True) -> GoalTaskConfig:
+def judging_config(
+    batch: int, body: str = "ball", difficulty: int = 5, *, world: str = DEFAULT_WORLD, plans: bool = True
+) -> GoalTaskConfig:
     """Return the settings under which controllers are judged: exact signals and the planner's instructions.
 
     Without `plans` they are random ones of every kind, and an episode ends after 1,000 steps on average.
@@ -98,6 +104,7 @@ def judging_config(batch: int, body: str = "ball", difficulty: int = 5, *, plans
     return GoalTaskConfig(
         batch=batch,
         body=body,
+        world=world,
         difficulty=difficulty,
         tolerance=COMPLETION_TOLERANCE,
         planned=float(plans),
@@ -180,6 +187,7 @@ class GoalTask:
         self.world = World(
             config.batch,
             body=config.body,
+            world=config.world,
             max_boxes=DIFFICULTIES[config.difficulty][1],
             threads=threads,
             tolerance=config.tolerance,

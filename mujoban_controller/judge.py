@@ -19,6 +19,7 @@ from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import Controller, Planner
 from mujoban_core.stats import wilson_interval
 from mujoban_sim.goals import GoalKind
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import generate_level
 
@@ -103,6 +104,7 @@ def judge(
     first_seed: int = 0,
     difficulty: int = 5,
     body: str = "ball",
+    world: str = DEFAULT_WORLD,
     batch: int = 64,
     threads: int = 1,
     plans: bool = True,
@@ -116,6 +118,7 @@ def judge(
         first_seed: Seed of the first level.
         difficulty: Of the levels.
         body: Robot's body.
+        world: The physical world, see `mujoban_sim.presets`.
         batch: Levels played at once.
         threads: Threads for physics.
         plans: Follow the planner; else instructions are random, towards walls and blocked boxes too, and only
@@ -127,7 +130,7 @@ def judge(
     """
     batch = min(batch, episodes)
     task = GoalTask(
-        judging_config(batch, body, difficulty, plans=plans), planner, SeededEpisodes(difficulty, first_seed),
+        judging_config(batch, body, difficulty, world=world, plans=plans), planner, SeededEpisodes(difficulty, first_seed),
         np.random.default_rng(first_seed), threads=threads,
     )  # fmt: skip
     last_seed = first_seed + episodes

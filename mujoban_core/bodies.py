@@ -42,6 +42,21 @@ class Actuator:
 
 
 @dataclass(frozen=True)
+class RobotPhysics:
+    """Figures of a robot that differ between worlds; a body's MJCF names those that it has in braces.
+
+    Attributes:
+        head_mass: mass of all but the ball [kg].
+        head_inertia: its moments of inertia about x, y and z [kg m^2].
+        friction: sliding, torsional and rolling friction of the ball.
+    """
+
+    head_mass: float
+    head_inertia: tuple[float, float, float]
+    friction: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class Body:
     """Everything that depends on the robot's body.
 
@@ -69,7 +84,8 @@ class Body:
         cell_size: edge of a cell in metres; the world is scaled by it, box mass and peg size are not (A.3).
         time_limit: steps of an episode at 20 Hz (240 s for the ball, 480 s for the ant).
         camera: how the body carries its first-person camera.
-        mjcf: the ``<body>`` element, with the camera `FIRST_PERSON_CAMERA` and the site ``imu``.
+        mjcf: the ``<body>`` element, with the camera `FIRST_PERSON_CAMERA` and the site ``imu``; the figures of
+            `RobotPhysics` stand in braces, for `fragment` to fill in.
     """
 
     name: str
@@ -107,6 +123,15 @@ class Body:
         else:
             qpos[3:7] = (math.cos(pose[2] / 2), 0.0, 0.0, math.sin(pose[2] / 2))
 
+    def fragment(self, physics: RobotPhysics) -> str:
+        """Return the MJCF of the robot's bodies with a world's figures."""
+        figures = {
+            "head_mass": physics.head_mass,
+            "head_inertia": " ".join(map(str, physics.head_inertia)),
+            "friction": " ".join(map(str, physics.friction)),
+        }
+        return self.mjcf.format(**figures)
+
     @cached_property
     def actuator_mjcf(self) -> str:
         """The ``<actuator>`` section; controls are normalised torques in [-1, 1]."""
@@ -134,7 +159,7 @@ _BALL_MJCF: Final = f"""
   <joint name="y" type="slide" axis="0 1 0"/>
   <joint name="z" type="slide" axis="0 0 1"/>
   <joint name="steer" type="hinge" axis="0 0 1" damping="4"/>
-  <inertial pos="0 0 -0.08" mass="20" diaginertia="0.11 0.11 0.147"/>
+  <inertial pos="0 0 -0.08" mass="{{head_mass}}" diaginertia="{{head_inertia}}"/>
   <site name="imu" pos="0 0 0" size="0.01" group="4"/>
   <geom name="head" class="robot_visual" type="cylinder" size="0.1 0.06" pos="0 0 -0.07" rgba="0.3 0.3 0.3 1"/>
   <geom name="ear_red" class="robot_visual" type="sphere" size="0.1" pos="0 -0.2 0" rgba="0.7 0 0 1"/>
@@ -142,7 +167,7 @@ _BALL_MJCF: Final = f"""
   {_BALL_CAMERA.mjcf(FIRST_PERSON_CAMERA, origin_height=_BALL_HEIGHT)}
   <body name="wheel" pos="0 0 -0.4">
     <joint name="roll" type="hinge" axis="0 1 0" damping="2"/>
-    <geom name="ball" class="robot" type="sphere" size="0.2" mass="1" condim="4" friction="0.5 0.005 0.0001"
+    <geom name="ball" class="robot" type="sphere" size="0.2" mass="1" condim="4" friction="{{friction}}"
           rgba="0.6 0.6 0.6 1"/>
   </body>
 </body>

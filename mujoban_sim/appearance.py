@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Callable
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.meshes import BANDS, DRAWN_WALL_HEIGHT, SKYLINE_HEIGHTS, SKYLINE_V
+from mujoban_sim.meshes import BANDS, SKYLINE_HEIGHTS, SKYLINE_V
 
 Image = NDArray[np.uint8]
 Pattern = NDArray[np.float64]
@@ -33,14 +34,6 @@ PRESSED_TARGET_COLOUR: Final = (0.05, 0.80, 0.10)
 _CELL_PIXELS: Final = 128
 _GUTTER: Final = 8
 """Rows by which a band goes on periodically on either side, so that filtering does not mix bands."""
-_BAND_PIXELS: Final = {
-    "side": round(_CELL_PIXELS * DRAWN_WALL_HEIGHT),
-    "top": _CELL_PIXELS,
-    "floor": _CELL_PIXELS,
-    "peg": 16,
-}
-ATLAS_SHAPE: Final = (sum(_BAND_PIXELS.values()) + 2 * _GUTTER * len(BANDS), _CELL_PIXELS, 3)
-"""Rows, columns and channels of an episode's texture."""
 SKYLINE_SHAPE: Final = (128, 2048, 3)
 """Rows, columns and channels of the skyline's texture."""
 
@@ -190,42 +183,62 @@ def _paint(rng: np.random.Generator, colour: Colour, grit: Pattern) -> NDArray[n
     return (colour + pattern[..., None] * (second - colour)) * grit[..., None]
 
 
-def band_range(band: str) -> tuple[float, float]:
-    """Return the range of texture coordinate v of a band of the atlas."""
-    first = _band_row(band)
-    return first / ATLAS_SHAPE[0], (first + _BAND_PIXELS[band]) / ATLAS_SHAPE[0]
+@dataclass(frozen=True)
+class Atlas:
+    """The texture of an episode's walls, floor and pegs: bands along v, see `mujoban_sim.meshes.BANDS`.
 
-
-def _band_row(band: str) -> int:
-    before = BANDS[: BANDS.index(band)]
-    return sum(_BAND_PIXELS[b] for b in before) + _GUTTER * (2 * len(before) + 1)
-
-
-def draw_atlas(seed: int) -> Image:
-    """Draw the texture of an episode's walls, floor and pegs; the same seed gives the same pixels.
-
-    Args:
-        seed: the episode's seed, >= 0.
-
-    Returns:
-        RGB of `ATLAS_SHAPE`; row 0 is at v = 0.
+    Attributes:
+        wall_height: height of drawn walls in cells, which is that of the band of their sides.
     """
-    rng = np.random.default_rng([_APPEARANCE_STREAM, seed])
-    grit = 1.0 + 0.08 * (_fractal_noise(rng, (_CELL_PIXELS, _CELL_PIXELS)) - 0.5)
-    wall = _draw_colour(rng)
-    bands = {
-        "side": _paint(rng, wall, grit[: _BAND_PIXELS["side"]]),
-        "top": _paint(rng, np.clip(wall * rng.choice([0.75, 1.2]), 0.0, 0.9), grit),
-        "floor": _paint(rng, _draw_colour(rng), grit),
-        "peg": np.full((_BAND_PIXELS["peg"], _CELL_PIXELS, 3), 0.45),
-    }
-    while min(np.linalg.norm(_mean(bands[b]) - _mean(bands["floor"])) for b in ("side", "top")) < _MIN_CONTRAST:
-        bands["floor"] = _paint(rng, _draw_colour(rng), grit)
-    floor = _mean(bands["floor"])
-    _outline(bands["floor"], np.clip(floor * (0.55 if floor.mean() > 0.4 else 1.6), 0.0, 0.9), 4)
-    _outline(bands["top"], 0.75 * _mean(bands["top"]), 3)
-    rows = [np.pad(bands[b], ((_GUTTER, _GUTTER), (0, 0), (0, 0)), mode="wrap") for b in BANDS]
-    return np.rint(255 * np.clip(np.concatenate(rows), 0.0, 1.0)).astype(np.uint8)
+
+    wall_height: float
+
+    @cached_property
+    def _band_pixels(self) -> dict[str, int]:
+        """Rows of each band."""
+        return {
+            "side": round(_CELL_PIXELS * self.wall_height),
+            "top": _CELL_PIXELS,
+            "floor": _CELL_PIXELS,
+            "peg": 16,
+        }
+
+    @cached_property
+    def shape(self) -> tuple[int, int, int]:
+        """Rows, columns and channels."""
+        return sum(self._band_pixels.values()) + 2 * _GUTTER * len(BANDS), _CELL_PIXELS, 3
+
+    def band_range(self, band: str) -> tuple[float, float]:
+        """Return the range of texture coordinate v of a band."""
+        before = BANDS[: BANDS.index(band)]
+        first = sum(self._band_pixels[b] for b in before) + _GUTTER * (2 * len(before) + 1)
+        return first / self.shape[0], (first + self._band_pixels[band]) / self.shape[0]
+
+    def draw(self, seed: int) -> Image:
+        """Draw the texture; the same seed gives the same pixels.
+
+        Args:
+            seed: the episode's seed, >= 0.
+
+        Returns:
+            RGB of `shape`; row 0 is at v = 0.
+        """
+        rng = np.random.default_rng([_APPEARANCE_STREAM, seed])
+        grit = 1.0 + 0.08 * (_fractal_noise(rng, (_CELL_PIXELS, _CELL_PIXELS)) - 0.5)
+        wall = _draw_colour(rng)
+        bands = {
+            "side": _paint(rng, wall, grit[: self._band_pixels["side"]]),
+            "top": _paint(rng, np.clip(wall * rng.choice([0.75, 1.2]), 0.0, 0.9), grit),
+            "floor": _paint(rng, _draw_colour(rng), grit),
+            "peg": np.full((self._band_pixels["peg"], _CELL_PIXELS, 3), 0.45),
+        }
+        while min(np.linalg.norm(_mean(bands[b]) - _mean(bands["floor"])) for b in ("side", "top")) < _MIN_CONTRAST:
+            bands["floor"] = _paint(rng, _draw_colour(rng), grit)
+        floor = _mean(bands["floor"])
+        _outline(bands["floor"], np.clip(floor * (0.55 if floor.mean() > 0.4 else 1.6), 0.0, 0.9), 4)
+        _outline(bands["top"], 0.75 * _mean(bands["top"]), 3)
+        rows = [np.pad(bands[b], ((_GUTTER, _GUTTER), (0, 0), (0, 0)), mode="wrap") for b in BANDS]
+        return np.rint(255 * np.clip(np.concatenate(rows), 0.0, 1.0)).astype(np.uint8)
 
 
 def _mean(image: NDArray[np.float64]) -> Colour:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mujoban_core.bodies import Body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, CONTROL_PERIOD, DIFFICULTIES, GRID_SIZE
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
@@ -177,7 +178,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
 
     ## Arguments
     ``gymnasium.make("Mujoban-v0", difficulty=5, level_file=None, observations="default", body="ball",
-    time_limit=None, render_mode=None)``. `import mujoban_sim` registers the environment.
+    world="eased", time_limit=None, render_mode=None)``. `import mujoban_sim` registers the environment.
 
     ## Version history
     v0: first version.
@@ -195,6 +196,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
         level_file: str | PathLike[str] | None = None,
         observations: ObservationSet = "default",
         body: str = "ball",
+        world: str = DEFAULT_WORLD,
         time_limit: int | None = None,
         render_mode: str | None = None,
     ) -> None:
@@ -205,6 +207,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
             level_file: levels in the Boxoban format, instead of generated ones.
             observations: observation set: ``"default"``, ``"state"`` (no cameras) or ``"privileged"``.
             body: the robot's body.
+            world: the physical world: ``"reference"`` or ``"eased"`` (`mujoban_sim.presets`).
             time_limit: steps of an episode; None: the body's.
             render_mode: None or ``"rgb_array"``: `render` returns a view from above.
 
@@ -216,7 +219,9 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
         self.render_mode = render_mode
         self._source = LevelSource.make(difficulty, level_file)
         self._names = check_observation_set(observations)
-        self.world = World(1, body=body, max_boxes=self._source.max_boxes, time_limit=time_limit)
+        self.world = World(
+            1, body=body, world=world, max_boxes=self._source.max_boxes, time_limit=time_limit
+        )
         self.observation_space = observation_space(self._names, self.world.body, self.world.max_boxes)
         self.action_space = spaces.Box(-1.0, 1.0, (self.world.body.action_size,), np.float32)
 

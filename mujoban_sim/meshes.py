@@ -17,9 +17,6 @@ from numpy.typing import NDArray
 from mujoban_core.grid import GRID_SIZE, cell_to_xy
 from mujoban_sim.scene import PEG_HALF_DIAGONAL, PEG_HEIGHT, peg_corners
 
-DRAWN_WALL_HEIGHT: Final = 0.5
-"""Height of drawn walls in cells: below the camera, so that wall tops and, from afar, what lies behind show."""
-
 BANDS: Final = ("side", "top", "floor", "peg")
 """Bands of the atlas along v, from v = 0."""
 
@@ -109,9 +106,10 @@ def _ground_quads(quads: _Quads, mask: NDArray[np.bool_], z: float, v_range: tup
     )
 
 
-def _wall_quads(quads: _Quads, wall: NDArray[np.bool_], v_range: tuple[float, float], cell: float) -> None:
-    """Add the wall sides that face free cells; runs along an axis are single quads."""
-    height = DRAWN_WALL_HEIGHT * cell
+def _wall_quads(
+    quads: _Quads, wall: NDArray[np.bool_], height: float, v_range: tuple[float, float], cell: float
+) -> None:
+    """Add the wall sides, of a height in metres, that face free cells; runs along an axis are single quads."""
     # In a frame turned by k quarter turns every side is a south side: the cell below (next row) is free.
     for k in range(4):
         turned = np.rot90(wall, k)
@@ -149,18 +147,21 @@ def _peg_quads(quads: _Quads, wall: NDArray[np.bool_], v_range: tuple[float, flo
     quads.add(np.column_stack([centre + ring[0], zero + PEG_HEIGHT]), first, second, zero + 0.1, v_range)
 
 
-def level_mesh(wall: NDArray[np.bool_], cell_size: float, band: Callable[[str], tuple[float, float]]) -> Mesh:
+def level_mesh(
+    wall: NDArray[np.bool_], cell_size: float, wall_height: float, band: Callable[[str], tuple[float, float]]
+) -> Mesh:
     """Return floor, walls and pegs of a level as one mesh.
 
     Args:
         wall: wall cells, [N, N].
         cell_size: edge of a cell in metres.
+        wall_height: height of drawn walls in cells.
         band: gives the range of v of a band of the atlas, see `BANDS`.
     """
     quads = _Quads()
     _ground_quads(quads, ~wall, 0.0, band("floor"), cell_size)
-    _ground_quads(quads, wall, DRAWN_WALL_HEIGHT * cell_size, band("top"), cell_size)
-    _wall_quads(quads, wall, band("side"), cell_size)
+    _ground_quads(quads, wall, wall_height * cell_size, band("top"), cell_size)
+    _wall_quads(quads, wall, wall_height * cell_size, band("side"), cell_size)
     _peg_quads(quads, wall, band("peg"), cell_size)
     return quads.mesh()
 

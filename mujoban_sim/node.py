@@ -24,6 +24,7 @@ from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.observation import ObservationPublisher
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.rendering import RenderingError
 from mujoban_sim.tick_messages import TickLabel
 from mujoban_sim.world import World
@@ -39,6 +40,7 @@ PARAMETERS: dict[str, Any] = {
     "level_file": "",
     "time_limit": 0,
     "body": "ball",
+    "world": DEFAULT_WORLD,
     "realtime": 0.0,
     "resend_after": 0.5,
     "await_recorder": False,
@@ -70,6 +72,7 @@ class SimulatorNode(Node):
             `episodes` 0 means as many as a level file has, else one.
         time_limit: Steps of an episode; 0 means that of the body.
         body: The robot's body.
+        world: The physical world, see `mujoban_sim.presets`.
         realtime: Simulated seconds per second; 0 is lockstep.
         resend_after: Seconds without an answer after which a tick is offered again in lockstep.
         await_recorder: Whether in lockstep a recorder must have acknowledged a tick before the next.
@@ -106,6 +109,7 @@ class SimulatorNode(Node):
         self.world = World(
             1,
             body=self._settings["body"],
+            world=self._settings["world"],
             max_boxes=self.episodes.max_boxes,
             time_limit=self._settings["time_limit"] or None,
         )

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from mujoban_core.bodies import ROBOT_BODY, ROBOT_DEFAULTS, Body
 from mujoban_core.camera import in_view
 from mujoban_core.grid import GRID_SIZE
-from mujoban_sim.appearance import ATLAS_SHAPE, SKYLINE_SHAPE, band_range, draw_atlas, draw_skyline
-from mujoban_sim.meshes import DRAWN_WALL_HEIGHT, MAX_QUADS, Mesh, level_mesh, skyline_mesh
+from mujoban_sim.appearance import SKYLINE_SHAPE, Atlas, draw_skyline
+from mujoban_sim.meshes import MAX_QUADS, Mesh, level_mesh, skyline_mesh
+from mujoban_sim.presets import WorldPreset
 from mujoban_sim.scene import BOX_HALF_EXTENT, box_vertices
 
 TOP_DOWN_CAMERA: Final = "top_down"
@@ -41,9 +42,10 @@ class RenderScene:
     box_geoms: NDArray[np.int64]
     target_geoms: NDArray[np.int64]
     cell_size: float
+    atlas: Atlas
 
 
-def _mjcf(body: Body, max_boxes: int, size: int) -> str:
+def _mjcf(body: Body, max_boxes: int, size: int, preset: WorldPreset) -> str:
     cell = body.cell_size
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
     boxes = "".join(
@@ -55,7 +57,7 @@ def _mjcf(body: Body, max_boxes: int, size: int) -> str:
     )
     height = _TOP_DOWN_HEIGHT * cell
     half_width = GRID_SIZE / 2 * cell
-    fovy = 2 * np.degrees(np.arctan2(half_width, height - DRAWN_WALL_HEIGHT * cell))
+    fovy = 2 * np.degrees(np.arctan2(half_width, height - preset.drawn_wall_height * cell))
     scale = max(cell, 1.0)
     return f"""
 <mujoco>
@@ -70,7 +72,7 @@ def _mjcf(body: Body, max_boxes: int, size: int) -> str:
   <default>{ROBOT_DEFAULTS}</default>
   <worldbody>
     <camera name="{TOP_DOWN_CAMERA}" pos="0 0 {height}" xyaxes="1 0 0 0 1 0" fovy="{fovy}"/>
-    {pads}{boxes}{body.mjcf}
+    {pads}{boxes}{body.fragment(preset.robot)}
   </worldbody>
 </mujoco>"""
 
@@ -106,18 +108,24 @@ def _blank_mesh() -> Mesh:
     return Mesh(corners, normals, corners[:, :2].copy(), np.concatenate([faces, fill]))
 
 
-def build_scene(body: Body, max_boxes: int, slots: int, size: int) -> RenderScene:
+def build_scene(body: Body, max_boxes: int, slots: int, size: int, preset: WorldPreset) -> RenderScene:
     """Compile the model that draws `slots` worlds in frames of up to `size` pixels."""
-    spec = mujoco.MjSpec.from_string(_mjcf(body, max_boxes, size))
+    spec = mujoco.MjSpec.from_string(_mjcf(body, max_boxes, size, preset))
+    atlas = Atlas(preset.drawn_wall_height)
     blank = _blank_mesh()
     for slot in range(slots):
-        _add_mesh(spec, f"level{slot}", blank, ATLAS_SHAPE)
+        _add_mesh(spec, f"level{slot}", blank, atlas.shape)
     _add_mesh(spec, "skyline", skyline_mesh(body.cell_size), SKYLINE_SHAPE)
-    spec.add_mesh(name="box", uservert=box_vertices(body.cell_size).ravel().tolist())
+    if preset.box_chamfer:
+        spec.add_mesh(name="box", uservert=box_vertices(body.cell_size, preset.box_chamfer).ravel().tolist())
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
-        if geom.name.startswith("box"):
+        if not geom.name.startswith("box"):
+            continue
+        if preset.box_chamfer:
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, "box"
+        else:
+            geom.type, geom.size = mujoco.mjtGeom.mjGEOM_BOX, body.cell_size * np.array(BOX_HALF_EXTENT)
     for name, mesh in (("static", "level0"), ("skyline", "skyline")):
         spec.worldbody.add_geom(
             name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, material=mesh, contype=0, conaffinity=0
@@ -131,6 +139,7 @@ def build_scene(body: Body, max_boxes: int, slots: int, size: int) -> RenderScen
         np.array([model.geom(f"box{i}").id for i in range(max_boxes)], np.int64),
         np.array([model.geom(f"target{i}").id for i in range(max_boxes)], np.int64),
         body.cell_size,
+        atlas,
     )
     # What moves at run time has to be drawn at its own frame, not at the one that compilation found.
     model.geom_sameframe[[scene.static_geom, scene.skyline_geom, *scene.target_geoms]] = 0
@@ -164,8 +173,9 @@ def write_level(scene: RenderScene, slot: int, wall: NDArray[np.bool_], seed: in
         wall: wall cells, [N, N].
         seed: the episode's seed.
     """
-    _write_mesh(scene.model, slot, level_mesh(wall, scene.cell_size, band_range))
-    _write_texture(scene.model, slot, draw_atlas(seed))
+    atlas = scene.atlas
+    _write_mesh(scene.model, slot, level_mesh(wall, scene.cell_size, atlas.wall_height, atlas.band_range))
+    _write_texture(scene.model, slot, atlas.draw(seed))
 
 
 def _write_mesh(model: mujoco.MjModel, index: int, mesh: Mesh) -> None:

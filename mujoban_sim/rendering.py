@@ -26,6 +26,7 @@ from mujoban_sim.appearance import (
     PRESSED_TARGET_COLOUR,
     TARGET_COLOUR,
 )
+from mujoban_sim.presets import WorldPreset
 from mujoban_sim.render_scene import TOP_DOWN_CAMERA, UNSEEN_GROUP, RenderScene, build_scene, write_level
 from mujoban_sim.scene import BOX_HALF_EXTENT
 from mujoban_sim.worker import Worker
@@ -70,8 +71,9 @@ def open_context(size: int) -> Any:
 class _Painter:
     """One OpenGL context with its scene; every call runs in its own thread, to which the context belongs."""
 
-    def __init__(self, body: Body, max_boxes: int, slots: int, size: int) -> None:
+    def __init__(self, body: Body, max_boxes: int, slots: int, size: int, preset: WorldPreset) -> None:
         self._body = body
+        self._preset = preset
         self._size = size
         self._slots = slots
         self._max_boxes = max_boxes
@@ -89,7 +91,7 @@ class _Painter:
         return self._scene.model.nq
 
     def _open(self) -> RenderScene:
-        scene = build_scene(self._body, self._max_boxes, self._slots, self._size)
+        scene = build_scene(self._body, self._max_boxes, self._slots, self._size, self._preset)
         model = scene.model
         self._gl = open_context(self._size)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
@@ -180,7 +182,16 @@ class FrameRenderer:
     Rows are the worlds of a batch of B; each shows the level and appearance of its latest `set_episode`.
     """
 
-    def __init__(self, batch: int, body: Body, max_boxes: int, size: int = FRAME_SIZE, threads: int = 1) -> None:
+    def __init__(
+        self,
+        batch: int,
+        body: Body,
+        max_boxes: int,
+        size: int = FRAME_SIZE,
+        threads: int = 1,
+        *,
+        preset: WorldPreset,
+    ) -> None:
         """Open `threads` OpenGL contexts for `batch` worlds with up to `max_boxes` boxes and as many targets.
 
         Args:
@@ -189,6 +200,7 @@ class FrameRenderer:
             max_boxes: K; qpos holds 3 K box positions and then the robot's.
             size: rows and columns of a frame.
             threads: frames of a batch are shared out among this many threads.
+            preset: the world's figures.
 
         Raises:
             RenderingError: if there is no OpenGL.
@@ -201,7 +213,7 @@ class FrameRenderer:
         threads = min(threads, batch)
         # Row r is slot r // threads of painter r % threads.
         self._painters = [
-            _Painter(body, max_boxes, len(range(first, batch, threads)), size) for first in range(threads)
+            _Painter(body, max_boxes, len(range(first, batch, threads)), size, preset) for first in range(threads)
         ]
         self._qpos_size = self._painters[0].qpos_size
         # A context that the garbage collector frees, in whatever thread it happens to run, deletes buffers of the

@@ -21,22 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import ROBOT_DEFAULTS, Body
-from mujoban_core.grid import CONTROL_PERIOD, GRID_SIZE, cell_to_xy
-
-PHYSICS_STEP: Final = 0.01
-"""Seconds of one physics step."""
-SUBSTEPS: Final = round(CONTROL_PERIOD / PHYSICS_STEP)
-"""Physics steps of one control step."""
+from mujoban_core.grid import GRID_SIZE, cell_to_xy
+from mujoban_sim.presets import WorldPreset
 
 _SETTLING_TIME: Final = 2.0
 
 BOX_HALF_EXTENT: Final = (0.4, 0.4, 0.15)
 """Half edges of a box in cells."""
-BOX_CHAMFER: Final = 0.03
-"""How much of a box's vertical edges is cut off, in cells: so a box slides between the next pegs, and back into its
-lane, from 0.12 cells off it instead of 0.1. With more, the pegs let go of a box too early in a push."""
-BOX_FRICTION: Final = 0.1
-"""Sliding friction of a box with all but the floor. With more, a robot that bends its way drags the box aside."""
 BOX_MASS: Final = 2.5
 """Mass of a box in kg, the same for every body (paper A.3)."""
 PEG_HALF_DIAGONAL: Final = 0.05
@@ -44,7 +35,7 @@ PEG_HALF_DIAGONAL: Final = 0.05
 PEG_HEIGHT: Final = 0.25
 """Height of a peg in metres, the same for every body."""
 WALL_HEIGHT: Final = 1.0
-"""Height of the physical walls in cells; drawn walls may be lower."""
+"""Height of the physical walls in cells; drawn walls may be lower (`WorldPreset.drawn_wall_height`)."""
 
 _PARKING: Final = 100.0
 """Boxes that a level lacks stand on the floor around (100, 100) cells, far outside the grid."""
@@ -58,14 +49,14 @@ _PEG_CAPACITY: Final = (GRID_SIZE - 1) ** 2
 # Contact bits: walls and pegs 1, boxes 2, floor 4, robot all. Boxes meet the floor through their feet only.
 _TEMPLATE: Final = """
 <mujoco>
-  <option timestep="{step}" solver="Newton" cone="pyramidal" integrator="Euler"/>
+  <option timestep="{step}" solver="Newton" cone="{cone}" integrator="Euler" noslip_iterations="{noslip}"/>
   <size memory="1M"/>
   <default>
-    <geom friction="0.5 0.005 0.0001"/>
+    <geom friction="{friction} 0.005 0.0001"/>
     <default class="slide"><joint type="slide"/></default>
     <default class="static"><geom type="box" contype="1" conaffinity="3" condim="3"/></default>
     <default class="box">
-      <geom type="mesh" mesh="box" contype="2" conaffinity="3" condim="3" mass="{box_mass}" priority="1"
+      <geom {box_shape} contype="2" conaffinity="3" condim="3" mass="{box_mass}" priority="{box_priority}"
             friction="{box_friction} 0.005 0.0001"/>
     </default>
     <default class="foot">
@@ -73,7 +64,7 @@ _TEMPLATE: Final = """
     </default>
     {robot_defaults}
   </default>
-  <asset><mesh name="box" vertex="{box_vertices}"/></asset>
+  <asset>{box_asset}</asset>
   <worldbody>
     <geom name="floor" type="plane" size="1 1 1" contype="4" conaffinity="4"/>
     {static}
@@ -118,28 +109,35 @@ def peg_corners(wall: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.argwhere(around < 3)
 
 
-def scene_mjcf(wall: NDArray[np.bool_], max_boxes: int, body: Body) -> str:
+def scene_mjcf(wall: NDArray[np.bool_], max_boxes: int, body: Body, preset: WorldPreset) -> str:
     """Return the MJCF of the physics of a level; where boxes and robot stand is a matter of state.
 
     Args:
         wall: [N, N], N = `GRID_SIZE`.
         max_boxes: K, boxes in the layout.
         body: the robot's body.
+        preset: the world's figures.
 
     Raises:
         ValueError: if the walls have another shape.
     """
     if wall.shape != (GRID_SIZE, GRID_SIZE):
         raise ValueError(f"walls have shape {wall.shape}: expected {(GRID_SIZE, GRID_SIZE)}")
+    box_shape, box_asset = _box_shape(body.cell_size, preset.box_chamfer)
     return _TEMPLATE.format(
-        step=PHYSICS_STEP,
+        step=preset.physics_step,
+        cone=preset.cone,
+        noslip=preset.noslip_iterations,
+        friction=preset.friction,
         box_mass=BOX_MASS,
-        box_friction=BOX_FRICTION,
-        box_vertices=" ".join(f"{x:.6g}" for x in box_vertices(body.cell_size).ravel()),
+        box_friction=preset.box_friction,
+        box_priority=int(preset.box_friction_prevails),
+        box_shape=box_shape,
+        box_asset=box_asset,
         robot_defaults=ROBOT_DEFAULTS,
         static="".join(_walls(wall, body.cell_size) + _pegs(wall, body.cell_size)),
         boxes="".join(_box(i, body.cell_size) for i in range(max_boxes)),
-        robot=body.mjcf,
+        robot=body.fragment(preset.robot),
         pairs="".join(_foot_pair(i) for i in range(max_boxes)),
         actuator=body.actuator_mjcf,
         sensor=body.sensor_mjcf,
@@ -166,10 +164,18 @@ def _pegs(wall: NDArray[np.bool_], cell_size: float) -> list[str]:
     return geoms + [f'<geom {shape} pos="{i} 5 -20"/>' for i in range(_PEG_CAPACITY - len(geoms))]
 
 
-def box_vertices(cell_size: float) -> NDArray[np.float64]:
-    """Return the corners of a box around its centre in metres, [16, 3]; it is their convex hull."""
+def _box_shape(cell_size: float, chamfer: float) -> tuple[str, str]:
+    """Return the attributes of a box's geom and the asset that they need; a plain box needs none."""
+    if chamfer == 0.0:
+        return f'type="box" size="{" ".join(f"{cell_size * half:.6g}" for half in BOX_HALF_EXTENT)}"', ""
+    vertices = " ".join(f"{x:.6g}" for x in box_vertices(cell_size, chamfer).ravel())
+    return 'type="mesh" mesh="box"', f'<mesh name="box" vertex="{vertices}"/>'
+
+
+def box_vertices(cell_size: float, chamfer: float) -> NDArray[np.float64]:
+    """Return the corners of a box with cut edges around its centre in metres, [16, 3]; it is their convex hull."""
     half = np.array(BOX_HALF_EXTENT)
-    corners = np.stack([half - [BOX_CHAMFER, 0.0, 0.0], half - [0.0, BOX_CHAMFER, 0.0]])
+    corners = np.stack([half - [chamfer, 0.0, 0.0], half - [0.0, chamfer, 0.0]])
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 1, 3)
     return cell_size * (signs * corners).reshape(-1, 3)
 
@@ -208,7 +214,7 @@ def settled_positions(model: mujoco.MjModel, max_boxes: int, body: Body) -> NDAr
     data.qpos[root:] = body.rest_qpos
     # Off the pegs: the centre of a cell.
     body.set_pose(data.qpos[root:], np.append(cell_to_xy([0, 0], body.cell_size), 0.0))
-    mujoco.mj_step(model, data, round(_SETTLING_TIME / PHYSICS_STEP))
+    mujoco.mj_step(model, data, round(_SETTLING_TIME / model.opt.timestep))
     return data.qpos.copy()
 
 
@@ -218,12 +224,13 @@ class SceneCache:
     A batch keeps the models that it runs on alive itself, so dropping one here is always safe.
     """
 
-    def __init__(self, body: Body, max_boxes: int, capacity: int = 1024) -> None:
-        """Compile models for `body` and layouts of `max_boxes` boxes; keep at most `capacity` of them."""
+    def __init__(self, body: Body, max_boxes: int, preset: WorldPreset, capacity: int = 1024) -> None:
+        """Compile models of a world for `body` and layouts of `max_boxes` boxes; keep at most `capacity` of them."""
         if capacity < 1:
             raise ValueError(f"capacity of the scene cache is {capacity}: expected at least 1")
         self._body = body
         self._max_boxes = max_boxes
+        self._preset = preset
         self._capacity = capacity
         self._models: OrderedDict[bytes, mujoco.MjModel] = OrderedDict()
 
@@ -232,7 +239,7 @@ class SceneCache:
         key = wall.tobytes()
         model = self._models.get(key)
         if model is None:
-            model = mujoco.MjModel.from_xml_string(scene_mjcf(wall, self._max_boxes, self._body))
+            model = mujoco.MjModel.from_xml_string(scene_mjcf(wall, self._max_boxes, self._body, self._preset))
             self._models[key] = model
             if len(self._models) > self._capacity:
                 self._models.popitem(last=False)

@@ -25,6 +25,7 @@ from mujoban_sim.env import (
     observation_space,
     observe,
 )
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 
 
@@ -44,6 +45,7 @@ class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]
         level_file: str | PathLike[str] | None = None,
         observations: ObservationSet = "default",
         body: str = "ball",
+        world: str = DEFAULT_WORLD,
         time_limit: int | None = None,
         render_mode: str | None = None,
         threads: int = 1,
@@ -57,6 +59,7 @@ class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]
             level_file: see there.
             observations: see there.
             body: see there.
+            world: see there.
             time_limit: see there.
             render_mode: see there.
             threads: threads for physics and for drawing; the results do not depend on it.
@@ -73,7 +76,12 @@ class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]
         self._source = LevelSource.make(difficulty, level_file)
         self._names = check_observation_set(observations)
         self.world = World(
-            num_envs, body=body, max_boxes=self._source.max_boxes, time_limit=time_limit, threads=threads
+            num_envs,
+            body=body,
+            world=world,
+            max_boxes=self._source.max_boxes,
+            time_limit=time_limit,
+            threads=threads,
         )
         self.single_observation_space = observation_space(self._names, self.world.body, self.world.max_boxes)
         self.single_action_space = spaces.Box(-1.0, 1.0, (self.world.body.action_size,), np.float32)

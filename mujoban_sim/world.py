@@ -19,7 +19,8 @@ from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET, WALL, cell_to_xy, xy_to_cell
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
-from mujoban_sim.scene import BOX_COORDINATES, SUBSTEPS, SceneCache, settled_positions
+from mujoban_sim.presets import DEFAULT_WORLD, get_world
+from mujoban_sim.scene import BOX_COORDINATES, SceneCache, settled_positions
 from mujoban_sim.world_kernels import KernelState, apply_torque, pack, update
 from mujoban_sokoban.episodes import EpisodeSpec
 
@@ -53,6 +54,7 @@ class World:
 
     Attributes:
         body: the robot's `Body`.
+        preset: the physical world's figures.
         pose: (x [m], y [m], psi [rad], in [-pi, pi]) of the robot, float32 [B, 3].
         velocity: (vx [m/s], vy [m/s], yaw rate [rad/s]) in the map frame, float32 [B, 3].
         proprio: o_pr, layout in `mujoban_core.bodies.Body`, float32 [B, P].
@@ -78,6 +80,7 @@ class World:
         batch: int,
         *,
         body: str = "ball",
+        world: str = DEFAULT_WORLD,
         max_boxes: int = 4,
         time_limit: int | None = None,
         threads: int = 1,
@@ -90,6 +93,7 @@ class World:
         Args:
             batch: B.
             body: name of the robot's body, a key of `mujoban_core.bodies.BODIES`.
+            world: name of the physical world, a key of `mujoban_sim.presets.WORLDS`.
             max_boxes: K, the most boxes of any level to be played.
             time_limit: steps after which an episode is truncated; None: the body's (240 s for the ball).
             threads: threads for physics; the results do not depend on it.
@@ -104,6 +108,7 @@ class World:
             if value < 1:
                 raise ValueError(f"{name} is {value}: expected at least 1")
         self.body = get_body(body)
+        self.preset = get_world(world)
         self.batch = batch
         self.max_boxes = max_boxes
         self.time_limit = self.body.time_limit if time_limit is None else time_limit
@@ -142,7 +147,7 @@ class World:
         self.truncated = np.zeros(b, np.bool_)
 
     def _start_physics(self, cached_scenes: int) -> None:
-        self._scenes = SceneCache(self.body, self.max_boxes, cached_scenes)
+        self._scenes = SceneCache(self.body, self.max_boxes, self.preset, cached_scenes)
         empty = self._scenes.model(np.zeros((GRID_SIZE, GRID_SIZE), np.bool_))
         self._models = [empty] * self.batch
         # Each row keeps its MjData, so that sensors at the new state cost no second pass.
@@ -302,10 +307,10 @@ class World:
             raise TorqueError(_torque_message(action))
         live = self._live
         if len(live) == self.batch:
-            self._physics.step(nstep=SUBSTEPS, stage=_STAGE_VELOCITY)
+            self._physics.step(nstep=self.preset.substeps, stage=_STAGE_VELOCITY)
         else:
             self.reward[:] = 0.0
-            self._physics.step(ids=live, nstep=SUBSTEPS, stage=_STAGE_VELOCITY)
+            self._physics.step(ids=live, nstep=self.preset.substeps, stage=_STAGE_VELOCITY)
         if update(live, True, self._kernel_state):
             self._live = np.flatnonzero(~self.done)
 
@@ -360,7 +365,9 @@ class World:
             # Worlds without a camera need no OpenGL.
             from mujoban_sim.rendering import FrameRenderer
 
-            self._renderers[size] = FrameRenderer(self.batch, self.body, self.max_boxes, size, self._threads)
+            self._renderers[size] = FrameRenderer(
+                self.batch, self.body, self.max_boxes, size, self._threads, preset=self.preset
+            )
             self._undrawn[size] = set(self._all_rows.tolist())
         return self._renderers[size]
 
