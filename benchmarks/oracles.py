@@ -20,6 +20,7 @@ from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.stats import wilson_interval
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
@@ -33,6 +34,8 @@ class Options:
     seed: int = 1000
     batch: int = 64
     threads: int = 2
+    world: str = DEFAULT_WORLD
+    """The physical world: reference or eased."""
 
 
 def run(options: Options | None = None) -> dict[str, Any]:
@@ -40,7 +43,7 @@ def run(options: Options | None = None) -> dict[str, Any]:
     options = options or Options()
     episodes = list(Episodes(options.levels, options.seed, difficulty=options.difficulty))
     batch = min(options.batch, len(episodes))
-    world = World(batch, threads=options.threads)
+    world = World(batch, world=options.world, threads=options.threads)
     policy = SensePlanAct(OracleEstimator(), OracleTermination(), OraclePlanner(), OracleController())
     issued, timed_out, solved = 0, 0, []
     returns, lengths, unsolved = [], [], []

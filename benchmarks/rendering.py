@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 
 from mujoban_core.camera import FRAME_SIZE
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.scene import SceneCache
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
@@ -28,9 +29,9 @@ THREADS = 2
 DIFFICULTY = 5
 
 
-def _make_world(threads: int) -> World:
+def _make_world(threads: int, name: str = DEFAULT_WORLD) -> World:
     episodes = Episodes(BATCH, seed=0, difficulty=DIFFICULTY)
-    world = World(BATCH, max_boxes=episodes.max_boxes, threads=threads)
+    world = World(BATCH, world=name, max_boxes=episodes.max_boxes, threads=threads)
     world.reset(np.arange(BATCH), list(episodes))
     world.render()
     return world
@@ -38,7 +39,7 @@ def _make_world(threads: int) -> World:
 
 def _default_renderer(world: World) -> Callable[[], int]:
     """Return a function that draws one frame of the physics scene as MuJoCo does when it is not told how."""
-    model = SceneCache(world.body, world.max_boxes).model(world.wall[0])
+    model = SceneCache(world.body, world.max_boxes, world.preset).model(world.wall[0])
     data = mujoco.MjData(model)
     data.qpos[:] = world.qpos[0]
     mujoco.mj_forward(model, data)

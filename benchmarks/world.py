@@ -21,7 +21,7 @@ import tyro
 
 import mujoban_sim  # noqa: F401 - registers the environment
 from mujoban_core.grid import xy_to_cell
-from mujoban_sim.scene import SUBSTEPS, SceneCache
+from mujoban_sim.scene import SceneCache
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
@@ -47,14 +47,14 @@ def _plain_loop(actions: np.ndarray) -> Callable[[], int]:
     """Return a function that steps the scene of an episode as MuJoCo's tutorial does; the limit of the others."""
     world = World(1)
     world.reset([0], list(Episodes(1, SEED)))
-    model = SceneCache(world.body, world.max_boxes).model(world.wall[0])
+    model = SceneCache(world.body, world.max_boxes, world.preset).model(world.wall[0])
     data = mujoco.MjData(model)
     data.qpos[:] = world.qpos[0]
 
     def advance() -> int:
         for action in actions:
             data.ctrl[:] = action
-            for _ in range(SUBSTEPS):
+            for _ in range(world.preset.substeps):
                 mujoco.mj_step(model, data)
         return len(actions)
 
@@ -137,7 +137,7 @@ def run(options: Options | None = None) -> dict[str, float]:
     """Measure the world.
 
     Returns:
-        Environment steps per second of the plain loop (`SUBSTEPS` calls of ``mj_step`` a step), of the Gymnasium
+        Environment steps per second of the plain loop (a call of ``mj_step`` for each physics step), of the Gymnasium
         environment without camera and of the vectorised one on 2 threads; their ratios to the plain loop; and the
         machine's load before (1 minute mean of waiting and running processes).
     """

@@ -17,6 +17,7 @@ from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
 from mujoban_core.plugins import LEARNED, ORACLE, ROLES, load_module, shipped_weights
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_rl.weights import WeightsError, digest
+from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 from mujoban_sim.rendering import RenderingError
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.solver import Status, solve_levels
@@ -133,6 +134,12 @@ def add_episode_options(parser: argparse.ArgumentParser, *, episodes: int | None
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode; episode i has seed + i")
     parser.add_argument("--time-limit", type=positive, metavar="STEPS", help="of an episode; the body's by default")
     parser.add_argument("--levels", type=Path, metavar="FILE", help="play the levels of a Boxoban text file instead")
+    add_world_option(parser)
+
+
+def add_world_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option that chooses the physical world."""
+    parser.add_argument("--world", choices=WORLDS, default=DEFAULT_WORLD, help="physical world, see docs/world.md")
 
 
 def add_module_options(parser: argparse.ArgumentParser) -> None:

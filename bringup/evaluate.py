@@ -25,6 +25,7 @@ from bringup.command import (
 from bringup.results import EpisodeResult, report, write_report
 from bringup.rollout import rollout
 from mujoban_core.sense_plan_act import SensePlanAct
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
@@ -61,6 +62,7 @@ def evaluate(
     policy: SensePlanAct,
     episodes: Episodes,
     *,
+    world: str = DEFAULT_WORLD,
     batch: int = 64,
     time_limit: int | None = None,
     threads: int = 1,
@@ -71,13 +73,18 @@ def evaluate(
     Args:
         policy: The four modules.
         episodes: Levels and seeds.
+        world: The physical world, see `mujoban_sim.presets`.
         batch: Rows of the world.
         time_limit: Steps of an episode; None means that of the body.
         threads: Threads of the physics.
         progress: Whether to show a progress bar on stderr.
     """
-    world = World(
-        min(batch, len(episodes)), max_boxes=episodes.max_boxes, time_limit=time_limit, threads=threads
+    robots = World(
+        min(batch, len(episodes)),
+        world=world,
+        max_boxes=episodes.max_boxes,
+        time_limit=time_limit,
+        threads=threads,
     )
     with SolvedBar(len(episodes), disable=not progress) as bar:
         ended: list[EpisodeResult] = []
@@ -86,7 +93,7 @@ def evaluate(
             ended.append(result)
             bar.show(ended)
 
-        return rollout(policy, world, episodes, on_result=on_result)
+        return rollout(policy, robots, episodes, on_result=on_result)
 
 
 def main(command_line: Sequence[str] | None = None) -> int:
@@ -107,22 +114,25 @@ def main(command_line: Sequence[str] | None = None) -> int:
     if arguments.graph:
         from bringup.stack import PlayOptions, play
 
-        options = PlayOptions(time_limit=arguments.time_limit)
+        options = PlayOptions(world=arguments.world, time_limit=arguments.time_limit)
         with SolvedBar(len(episodes)) as bar:
             outcome = play(
                 stack, episodes, options, on_refresh=lambda _, results: bar.show(results), refresh_period=1.0
             )
-        content = report(outcome.results, stack.identities(), ticks_per_second=outcome.ticks_per_second)
+        content = report(
+            outcome.results, stack.identities(), world=arguments.world, ticks_per_second=outcome.ticks_per_second
+        )
     else:
         results = evaluate(
             stack.policy(),
             episodes,
+            world=arguments.world,
             batch=arguments.batch,
             time_limit=arguments.time_limit,
             threads=arguments.threads,
             progress=True,
         )
-        content = report(results, stack.identities())
+        content = report(results, stack.identities(), world=arguments.world)
     if arguments.json is None:
         print(json.dumps(content, indent=2))
     else:

@@ -17,12 +17,21 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from bringup.command import Parser, Stack, add_module_options, import_from_here, run_command, stack_from
+from bringup.command import (
+    Parser,
+    Stack,
+    add_module_options,
+    add_world_option,
+    import_from_here,
+    run_command,
+    stack_from,
+)
 from bringup.exploration import Disturbance, disturbed
 from bringup.rollout import ticks
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_rl.limits import StopSignal
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec, LazyEpisodes, after_moves
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
@@ -95,6 +104,7 @@ class Job:
     batch: int
     time_limit: int | None
     seed: int
+    world: str = DEFAULT_WORLD
 
 
 def record(job: Job, progress: Progress | None = None) -> int:
@@ -107,7 +117,7 @@ def record(job: Job, progress: Progress | None = None) -> int:
     policy: SensePlanAct = job.stack.policy()
     if job.disturbance is not None:
         policy = disturbed(policy, job.disturbance, np.random.default_rng(job.seed))
-    world = World(min(job.batch, len(job.episodes)), time_limit=job.time_limit)
+    world = World(min(job.batch, len(job.episodes)), world=job.world, time_limit=job.time_limit)
     task = None if progress is None else progress.add_task("recorded", total=len(job.episodes))
     difficulties = [job.episodes.difficulty(i) for i in range(len(job.episodes))]
     recording = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix)
@@ -159,6 +169,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--batch", type=int, default=32, help="episodes at the same time in each process")
     parser.add_argument("--processes", type=int, default=2, help="processes that share the work")
     parser.add_argument("--undisturbed", action="store_true", help="let the policy do as it will")
+    add_world_option(parser)
     add_module_options(parser)
     return parser.parse_args()
 
@@ -179,6 +190,7 @@ def _job(arguments: argparse.Namespace, part: int) -> Job:
         batch=arguments.batch,
         time_limit=arguments.time_limit or None,
         seed=arguments.seed + part,
+        world=arguments.world,
     )
 
 

@@ -61,6 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     weights = stack.identities()
     console = Console()
     play_options = PlayOptions(
+        world=options.world,
         realtime=options.realtime,
         time_limit=options.time_limit,
         processes=options.processes,
@@ -78,7 +79,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 live.update(live_view(monitor.episode, monitor.latest, results), refresh=True)
 
             outcome = play(stack, episodes, play_options, on_refresh=refresh)
-    content = report(outcome.results, weights, ticks_per_second=outcome.ticks_per_second, counts=dict(outcome.counts))
+    content = report(
+        outcome.results,
+        weights,
+        world=options.world,
+        ticks_per_second=outcome.ticks_per_second,
+        counts=dict(outcome.counts),
+    )
     _sum_up(console, outcome, content["success_interval"])
     if options.json is not None:
         write_report(content, options.json)

@@ -26,6 +26,7 @@ from bringup.results import EpisodeResult
 from bringup.video import EDGE, VideoNode
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_msgs_py.runtime.tick_node import init_ros, noted_signals, spin
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.episodes import Episodes
 
 DRAIN_TIMEOUT = 5.0
@@ -36,6 +37,8 @@ DRAIN_TIMEOUT = 5.0
 class PlayOptions:
     """How the graph is run."""
 
+    world: str = DEFAULT_WORLD
+    """The physical world, see `mujoban_sim.presets`."""
     realtime: float = 0.0
     """Simulated seconds per second; 0 is lockstep."""
     time_limit: int | None = None
@@ -89,6 +92,7 @@ def play(
     parameters = graph_parameters(
         stack,
         episodes,
+        world=options.world,
         realtime=options.realtime,
         time_limit=options.time_limit or 0,
         await_recorder=options.record is not None,

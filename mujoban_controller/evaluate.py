@@ -25,6 +25,7 @@ from mujoban_core.files import write_atomically
 from mujoban_core.interfaces import Controller
 from mujoban_rl.weights import digest, load_weights
 from mujoban_sim.oracles import OraclePlanner
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import TEST_SEEDS
 
 
@@ -43,6 +44,8 @@ class Options:
     """Seed of the first level; level i has seed + i."""
     difficulty: int = 5
     body: str = "ball"
+    world: str = DEFAULT_WORLD
+    """The physical world: reference or eased."""
     batch: int = 64
     threads: int = 1
     device: str = "cpu"
@@ -78,13 +81,14 @@ def main() -> int:
         driver, identity = make_driver(options)
         report = judge(
             driver, OraclePlanner(), episodes=options.episodes, first_seed=options.seed,
-            difficulty=options.difficulty, body=options.body, batch=options.batch, threads=options.threads,
-            plans=options.instructions == "plans",
+            difficulty=options.difficulty, body=options.body, world=options.world, batch=options.batch,
+            threads=options.threads, plans=options.instructions == "plans",
         )  # fmt: skip
     except (ValueError, OSError) as error:
         print(f"mujoban_controller.evaluate: error: {error}", file=sys.stderr)
         return 2
-    text = json.dumps({**report, "weights": identity, "episodes": options.episodes, "seed": options.seed}, indent=2)
+    told = {"weights": identity, "world": options.world, "episodes": options.episodes, "seed": options.seed}
+    text = json.dumps({**report, **told}, indent=2)
     if options.json is None:
         print(text)
     else:

@@ -130,8 +130,8 @@ def judge(
     """
     batch = min(batch, episodes)
     task = GoalTask(
-        judging_config(batch, body, difficulty, world=world, plans=plans), planner, SeededEpisodes(difficulty, first_seed),
-        np.random.default_rng(first_seed), threads=threads,
+        judging_config(batch, body, difficulty, world=world, plans=plans), planner,
+        SeededEpisodes(difficulty, first_seed), np.random.default_rng(first_seed), threads=threads,
     )  # fmt: skip
     last_seed = first_seed + episodes
     drive = ControllerDriver(driver) if isinstance(driver, Controller) else driver

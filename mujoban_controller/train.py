@@ -257,7 +257,7 @@ class TrainingRun:
         product.eval()
         report = judge(
             learner.driver, OraclePlanner(), episodes=options.evaluation_episodes, body=self.config.task.body,
-            difficulty=self.config.task.difficulty, threads=options.threads,
+            world=self.config.task.world, difficulty=self.config.task.difficulty, threads=options.threads,
         )  # fmt: skip
         product.train()
         kinds = report["instructions"]["kinds"]

@@ -19,6 +19,7 @@ from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.interfaces import Observation
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.rendering import RenderingError
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
@@ -39,6 +40,8 @@ class Picture:
     """Seed of the episode, at least 0."""
     difficulty: int = 5
     """1 to 5."""
+    world: str = DEFAULT_WORLD
+    """The physical world: reference or eased."""
     steps: int = 600
     """Steps of the episode to the last moment, at least 4; 20 are a second."""
 
@@ -57,7 +60,7 @@ def draw_picture(config: Picture) -> Image.Image:
     if config.steps < 4:
         raise ValueError(f"steps is {config.steps}: expected at least 4")
     level = generate_level(config.difficulty, config.seed)
-    world = World(1, max_boxes=len(level.boxes))
+    world = World(1, world=config.world, max_boxes=len(level.boxes))
     world.reset([0], [EpisodeSpec(level, config.seed)])
     policy = SensePlanAct(OracleEstimator(), OracleTermination(), OraclePlanner(), OracleController())
     state = policy.initial_state(np.array([config.seed]))

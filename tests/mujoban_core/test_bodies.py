@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from mujoban_core.bodies import BALL, BODIES, FIRST_PERSON_CAMERA, INERTIAL_SIZE, get_body
+from mujoban_sim.presets import EASED
 from mujoban_sim.scene import scene_mjcf
 
 
 @pytest.fixture(scope="module")
 def model():
-    return mujoco.MjModel.from_xml_string(scene_mjcf(np.zeros((10, 10), bool), 1, BALL))
+    return mujoco.MjModel.from_xml_string(scene_mjcf(np.zeros((10, 10), bool), 1, BALL, EASED))
 
 
 def test_unknown_body_is_named_in_the_error():
@@ -21,7 +22,7 @@ def test_unknown_body_is_named_in_the_error():
 @pytest.mark.parametrize("name", sorted(BODIES))
 def test_a_body_describes_its_own_mjcf(name):
     body = BODIES[name]
-    model = mujoco.MjModel.from_xml_string(scene_mjcf(np.zeros((10, 10), bool), 2, body))
+    model = mujoco.MjModel.from_xml_string(scene_mjcf(np.zeros((10, 10), bool), 2, body, EASED))
     assert model.nu == body.action_size
     assert model.nq == 2 * 3 + body.qpos_size
     assert model.nsensordata == INERTIAL_SIZE

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from mujoban_core.bodies import BALL, FIRST_PERSON_CAMERA, ROBOT_DEFAULTS
 from mujoban_core.camera import camera_extrinsics, camera_intrinsics, in_view, project
+from mujoban_sim.presets import EASED
 
 poses = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-7, 7)).map(np.array)
 points = st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(0, 2)).map(np.array)
@@ -16,7 +17,7 @@ points = st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(0, 2)).map(np.a
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (1.5, -2.5, 2.0), (-3.2, 0.7, -1.1)])
 def test_extrinsics_are_those_of_the_camera_that_the_body_carries(pose):
     model = mujoco.MjModel.from_xml_string(f"""
-        <mujoco><default>{ROBOT_DEFAULTS}</default><worldbody>{BALL.mjcf}</worldbody></mujoco>""")
+        <mujoco><default>{ROBOT_DEFAULTS}</default><worldbody>{BALL.fragment(EASED.robot)}</worldbody></mujoco>""")
     data = mujoco.MjData(model)
     data.qpos[[0, 1, 3]] = pose
     mujoco.mj_forward(model, data)

@@ -5,34 +5,33 @@ import numpy as np
 import pytest
 
 from mujoban_sim.appearance import (
-    ATLAS_SHAPE,
     BOX_COLOUR,
     BOX_ON_TARGET_COLOUR,
     PRESSED_TARGET_COLOUR,
     SKYLINE_SHAPE,
     TARGET_COLOUR,
-    band_range,
-    draw_atlas,
+    Atlas,
     draw_skyline,
 )
 from mujoban_sim.meshes import BANDS
 
 SEEDS = [*range(40), 10_000_000, 2**62 - 1]
+ATLAS = Atlas(0.5)
 
 
 @pytest.fixture(scope="module")
 def atlases():
-    return [draw_atlas(seed) for seed in SEEDS]
+    return [ATLAS.draw(seed) for seed in SEEDS]
 
 
 def band_pixels(atlas, band):
-    low, high = (round(v * ATLAS_SHAPE[0]) for v in band_range(band))
+    low, high = (round(v * ATLAS.shape[0]) for v in ATLAS.band_range(band))
     return atlas[low:high] / 255.0
 
 
 def test_the_same_seed_gives_the_same_textures():
-    np.testing.assert_array_equal(draw_atlas(7), draw_atlas(7))
-    assert draw_atlas(7).shape == ATLAS_SHAPE
+    np.testing.assert_array_equal(ATLAS.draw(7), ATLAS.draw(7))
+    assert ATLAS.draw(7).shape == ATLAS.shape
 
 
 def test_different_seeds_give_different_textures(atlases):
@@ -56,8 +55,12 @@ def test_walls_and_floor_differ_in_every_episode(atlases):
         assert min(np.linalg.norm(side - floor), np.linalg.norm(top - floor)) > 0.12
 
 
-def test_bands_are_disjoint():
-    ranges = [band_range(band) for band in BANDS]
+@pytest.mark.parametrize("wall_height", [0.5, 1.0])
+def test_bands_are_disjoint_and_a_cell_of_wall_is_drawn_as_high_as_it_is_wide(wall_height):
+    atlas = Atlas(wall_height)
+    low, high = atlas.band_range("side")
+    assert (high - low) * atlas.shape[0] == pytest.approx(wall_height * atlas.shape[1])
+    ranges = [atlas.band_range(band) for band in BANDS]
     assert all(0 < low < high < 1 for low, high in ranges)
     assert all(high < low for (_, high), (low, _) in itertools.pairwise(ranges))
 

@@ -4,9 +4,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mujoban_core.grid import cell_to_xy, xy_to_cell
-from mujoban_sim.appearance import band_range
-from mujoban_sim.meshes import DRAWN_WALL_HEIGHT, MAX_QUADS, level_mesh, skyline_mesh
+from mujoban_sim.appearance import Atlas
+from mujoban_sim.meshes import MAX_QUADS, level_mesh, skyline_mesh
 from mujoban_sim.scene import PEG_HEIGHT
+
+BAND = Atlas(0.5).band_range
 
 
 @st.composite
@@ -23,11 +25,11 @@ def triangles(mesh):
     return corners, cross, np.linalg.norm(cross, axis=-1) / 2
 
 
-@given(walls(), st.sampled_from([1.0, 3.0]))
-def test_floor_wall_tops_and_sides_have_the_area_of_the_level(wall, cell):
-    corners, cross, area = triangles(level_mesh(wall, cell, band_range))
+@given(walls(), st.sampled_from([1.0, 3.0]), st.sampled_from([0.5, 1.0]))
+def test_floor_wall_tops_and_sides_have_the_area_of_the_level(wall, cell, wall_height):
+    corners, cross, area = triangles(level_mesh(wall, cell, wall_height, BAND))
     horizontal, z = cross[:, 2] > 1e-9, corners[:, :, 2].mean(axis=1)
-    height = DRAWN_WALL_HEIGHT * cell
+    height = wall_height * cell
     assert area[horizontal & (z == 0)].sum() == pytest.approx((~wall).sum() * cell**2)
     top = horizontal & np.isclose(z, height, atol=1e-6) & ~np.isclose(z, PEG_HEIGHT)
     assert area[top].sum() == pytest.approx(wall.sum() * cell**2)
@@ -38,7 +40,7 @@ def test_floor_wall_tops_and_sides_have_the_area_of_the_level(wall, cell):
 
 @given(walls())
 def test_wall_sides_face_the_free_cell_before_them(wall):
-    corners, cross, area = triangles(level_mesh(wall, 1.0, band_range))
+    corners, cross, area = triangles(level_mesh(wall, 1.0, 0.5, BAND))
     sides = (cross[:, 2] == 0) & (corners[:, :, 2].max(axis=1) > PEG_HEIGHT + 1e-6)
     normal = (cross / (2 * area[:, None]))[sides]
     start = corners[sides].min(axis=1) + 0.25 * (1 - np.abs(normal)) * (0, 0, 1)
@@ -52,7 +54,7 @@ def test_wall_sides_face_the_free_cell_before_them(wall):
 
 @given(walls())
 def test_any_level_fits_in_the_capacity_and_its_normals_agree_with_its_windings(wall):
-    mesh = level_mesh(wall, 1.0, band_range)
+    mesh = level_mesh(wall, 1.0, 0.5, BAND)
     assert len(mesh.faces) <= 2 * MAX_QUADS
     assert len(mesh.vertices) <= 4 * MAX_QUADS
     _, cross, area = triangles(mesh)
@@ -63,7 +65,7 @@ def test_any_level_fits_in_the_capacity_and_its_normals_agree_with_its_windings(
 def test_pegs_stand_turned_by_45_degrees_at_the_corners_of_cells():
     wall = np.ones((10, 10), bool)
     wall[1:-1, 1:-1] = False
-    corners, cross, _ = triangles(level_mesh(wall, 1.0, band_range))
+    corners, cross, _ = triangles(level_mesh(wall, 1.0, 0.5, BAND))
     tops = corners[(cross[:, 2] > 0) & np.isclose(corners[:, :, 2].mean(axis=1), PEG_HEIGHT)].reshape(-1, 3)
     expected = {tuple(xy) for xy in cell_to_xy(np.argwhere(np.ones((9, 9))) + 0.5)}
     assert expected >= {tuple(xy) for xy in np.round(tops[:, :2])}

@@ -8,6 +8,7 @@ import pytest
 from mujoban_core.bodies import BALL
 from mujoban_core.camera import project
 from mujoban_core.grid import cell_to_xy
+from mujoban_sim.presets import EASED, REFERENCE
 from mujoban_sim.rendering import FrameRenderer, RenderingError
 from mujoban_sim.scene import parked_position
 from mujoban_sokoban.levels import Level
@@ -42,14 +43,14 @@ COLOURS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "yellow": (1
 
 @pytest.fixture(scope="module")
 def renderer():
-    renderer = FrameRenderer(BATCH, BALL, BOXES)
+    renderer = FrameRenderer(BATCH, BALL, BOXES, preset=EASED)
     yield renderer
     renderer.close()
 
 
 @pytest.fixture(scope="module")
 def threaded():
-    renderer = FrameRenderer(BATCH, BALL, BOXES, threads=2)
+    renderer = FrameRenderer(BATCH, BALL, BOXES, threads=2, preset=EASED)
     yield renderer
     renderer.close()
 
@@ -217,7 +218,7 @@ def test_leaving_out_what_is_out_of_view_changes_no_pixel(renderer, monkeypatch)
 @pytest.mark.parametrize("cell_size", [1.0, 3.0])
 def test_frames_have_the_size_asked_for_and_the_world_scales_with_the_body(cell_size):
     body = dataclasses.replace(BALL, cell_size=cell_size)
-    renderer = FrameRenderer(1, body, BOXES, size=96)
+    renderer = FrameRenderer(1, body, BOXES, size=96, preset=EASED)
     try:
         renderer.set_episode(0, CRAMPED, 0)
         first = renderer.render(state(CRAMPED, body=body, batch=1), flags(1), flags(1))
@@ -242,11 +243,11 @@ def test_bad_input_is_named(renderer):
     with pytest.raises(ValueError, match="row is 4"):
         renderer.set_episode(4, OPEN, 0)
     with pytest.raises(ValueError, match="threads is 0"):
-        FrameRenderer(1, BALL, 1, threads=0)
+        FrameRenderer(1, BALL, 1, threads=0, preset=EASED)
 
 
 def test_a_row_without_an_episode_is_an_error_and_so_is_a_level_with_too_many_targets():
-    renderer = FrameRenderer(1, BALL, 1)
+    renderer = FrameRenderer(1, BALL, 1, preset=EASED)
     try:
         with pytest.raises(ValueError, match="have no episode yet"):
             renderer.render(np.zeros((1, 3 + len(BALL.rest_qpos))), np.zeros((1, 1), bool), np.zeros((1, 1), bool))
@@ -262,12 +263,12 @@ def test_without_opengl_the_error_names_the_packages_to_install(monkeypatch):
 
     monkeypatch.setattr(importlib, "import_module", fail)
     with pytest.raises(RenderingError, match="libegl1 and libgl1-mesa-dri"):
-        FrameRenderer(1, BALL, 1)
+        FrameRenderer(1, BALL, 1, preset=EASED)
 
 
 def test_a_renderer_that_the_garbage_collector_frees_does_no_harm_to_another():
-    kept = FrameRenderer(1, BALL, BOXES)
-    dropped = FrameRenderer(1, BALL, BOXES)
+    kept = FrameRenderer(1, BALL, BOXES, preset=EASED)
+    dropped = FrameRenderer(1, BALL, BOXES, preset=EASED)
     cycle = [dropped]
     cycle.append(cycle)
     del dropped, cycle
@@ -277,3 +278,32 @@ def test_a_renderer_that_the_garbage_collector_frees_does_no_harm_to_another():
     frame = kept.render(np.zeros((1, kept._qpos_size)), np.zeros((1, BOXES), bool), np.zeros((1, BOXES), bool))
     assert frame.std() > 0
     kept.close()
+
+
+WALLED = Level.from_text("""\
+##########
+#        #
+#        #
+#    #   #
+#@ $ #  .#
+#    #   #
+#        #
+#        #
+#        #
+##########
+""")
+
+
+@pytest.mark.parametrize(("preset", "seen"), [(REFERENCE, False), (EASED, True)])
+def test_full_walls_hide_what_is_behind_them_and_boxes_are_looked_over(preset, seen):
+    renderer = FrameRenderer(1, BALL, BOXES, preset=preset)
+    try:
+        renderer.set_episode(0, WALLED, 0)
+        near, far = (-0.5, 0.5, 0.0), (-3.5, 0.5, 0.0)
+        behind = renderer.render(state(WALLED, near, batch=1), flags(1), flags(1))[0]
+        assert any(name_of(pixel) == "red" for pixel in behind.reshape(-1, 3)) == seen
+        over = renderer.render(state(WALLED, far, batch=1), flags(1), flags(1))[0]
+        assert name_of(pixel_at(over, (-1.2, 0.5, 0.3), far)) == "yellow"
+        assert name_of(pixel_at(over, (0.0, 0.5, 0.3), far)) is None
+    finally:
+        renderer.close()
