@@ -29,7 +29,8 @@ from mujoban_controller.train import TrainConfig, make_learner
 from mujoban_core.grid import GRID_SIZE, xy_to_cell
 from mujoban_core.interfaces import ControllerInput
 from mujoban_rl.limits import StopSignal
-from mujoban_rl.mpo_continuous import MPOConfig, MPOLoss, td_target
+from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
+from mujoban_rl.losses.returns import td_target
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import generate_level
@@ -110,7 +111,7 @@ class PendulumMPO:
         self._target = deepcopy(self._policy)
         self._loss = MPOLoss(1, MPOConfig(epsilon_scale=1e-5))
         self._optimiser = torch.optim.Adam(self._policy.parameters(), 1e-3)
-        self._duals = torch.optim.Adam(self._loss.parameters(), 1e-2)
+        self._duals = self._loss.duals.adam(1e-2)
         self._data: list[NDArray[np.float32]] = []
         self._seed = seed
         self._updates = 0
@@ -159,7 +160,6 @@ class PendulumMPO:
         loss.backward()
         self._optimiser.step()
         self._duals.step()
-        self._loss.limit_duals()
         self._updates += 1
         if self._updates % 50 == 0:
             self._target.load_state_dict(self._policy.state_dict())

@@ -25,7 +25,9 @@ from mujoban_controller.goal_task import GoalTask, TaskStep
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
 from mujoban_controller.replay import SequenceReplay, memory_fields
 from mujoban_core.interfaces import Memory, renew_rows
-from mujoban_rl.mpo_continuous import MPOConfig, MPOLoss, td_target
+from mujoban_rl.losses.mpo import scalars
+from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
+from mujoban_rl.losses.returns import td_target
 
 Policy = PrivilegedPolicy | VisuomotorController
 
@@ -121,7 +123,7 @@ class MPOLearner:
         self.target_policy, self.target_critic = deepcopy(policy), deepcopy(self.critic)
         self.policy_optimiser = torch.optim.Adam(policy.parameters(), config.policy_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate)
-        self.dual_optimiser = torch.optim.Adam(self.loss.parameters(), config.loss.dual_learning_rate)
+        self.dual_optimiser = self.loss.duals.adam(config.loss.dual_learning_rate)
         self.updates = 0
 
     def update(self, replay: SequenceReplay, rng: np.random.Generator) -> dict[str, Tensor]:
@@ -173,8 +175,8 @@ class MPOLearner:
         loss.backward()
         norm = self._step(self.policy, self.policy_optimiser)
         self.dual_optimiser.step()
-        self.loss.limit_duals()
-        return {**{f"mpo/{k}": v for k, v in stats.items()}, "gradient_norm": norm}
+        named = {name: torch.tensor(value) for name, value in scalars(stats._asdict()).items()}
+        return {**named, "gradient_norm": norm}
 
     def _step(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Tensor:
         """Apply the gradients unless they are not finite; return their norm."""

@@ -29,8 +29,10 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.teacher import DISCOUNT
 from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares, solve_rates
 from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
-from mujoban_rl.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
-from mujoban_rl.replay import TimeMajorReplay, windowed_returns
+from mujoban_rl.losses.mpo import scalars
+from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
+from mujoban_rl.losses.returns import windowed_returns
+from mujoban_rl.replay import TimeMajorReplay
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.training_log import TrainingLog
 from mujoban_rl.weights import digest, provenance, save_weights
@@ -271,9 +273,8 @@ class MPOTrainer:
         if self.updates % config.target_period == 0:
             self.target.load_state_dict(self.network.state_dict())
         finished = self.replay.storage["terminated"][: len(self.replay)].float().mean()
-        named = {f"mpo/{k}": float(v) for k, v in stats._asdict().items()}
         progress = {"q_loss": q_loss.detach(), "mean_reward": reward.mean(), "solved_per_step": finished}
-        return {k: float(v) for k, v in progress.items()} | named
+        return {k: float(v) for k, v in progress.items()} | scalars(stats._asdict())
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16)

@@ -9,16 +9,9 @@ import pytest
 import torch
 from torch import nn
 
-from mujoban_rl.mpo_continuous import (
-    MPOConfig,
-    MPOLoss,
-    action_cost,
-    gaussian_kl,
-    gaussian_log_prob,
-    nonparametric_kl,
-    td_target,
-    weights_and_temperature_loss,
-)
+from mujoban_rl.losses.mpo import Duals, improve, scalars
+from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss, action_cost
+from mujoban_rl.losses.returns import td_target
 
 
 class Bandit:
@@ -32,7 +25,7 @@ class Bandit:
         self.target = (self.mean.detach().clone(), self.log_scale.detach().exp())
         self.loss = MPOLoss(size, config)
         self.policy_optimiser = torch.optim.Adam([self.mean, self.log_scale], rate)
-        self.dual_optimiser = torch.optim.Adam(self.loss.parameters(), 3e-2)
+        self.dual_optimiser = self.loss.duals.adam(3e-2)
 
     def run(self, steps, period=10, states=32, samples=20):
         history = []
@@ -47,8 +40,7 @@ class Bandit:
             loss.backward()
             self.policy_optimiser.step()
             self.dual_optimiser.step()
-            self.loss.limit_duals()
-            history.append({k: float(v) for k, v in stats.items()})
+            history.append(scalars(stats._asdict()))
             if step % period == period - 1:
                 self.target = (self.mean.detach().clone(), self.log_scale.detach().exp())
         return history
@@ -68,7 +60,7 @@ def test_converges_to_the_optimum_of_a_quadratic_bandit():
 def test_temperature_settles_where_the_e_step_meets_its_constraint():
     config = MPOConfig(initial_temperature=1.0, initial_alpha_mean=1.0)
     history = Bandit(lambda a: 3 * a.sum(-1), config=config).run(500)
-    assert np.mean([h["kl_q_relative"] for h in history[-100:]]) == pytest.approx(1.0, abs=0.15)
+    assert np.mean([h["mpo/kl_improvement"] for h in history[-100:]]) == pytest.approx(1.0, abs=0.15)
 
 
 def test_mean_moves_at_the_speed_of_its_constraint():
@@ -77,7 +69,7 @@ def test_mean_moves_at_the_speed_of_its_constraint():
         initial_temperature=1.0, initial_alpha_mean=20.0, epsilon_mean=1e-3, epsilon_penalty=0.0, epsilon_scale=1e-5
     )
     history = Bandit(lambda a: 30 * a.sum(-1), config=config, rate=2e-3).run(900, period=25)
-    ends = [h["kl_mean_relative"] for h in history[-250:]]
+    ends = [h["mpo/kl_mean"] for h in history[-250:]]
     assert np.mean(ends) == pytest.approx(1.0, abs=0.5)
 
 
@@ -94,26 +86,40 @@ def test_action_penalty_keeps_the_mean_near_the_box():
 
 def test_optimal_temperature_minimises_its_dual():
     q = torch.randn(500, 8, generator=torch.Generator().manual_seed(1))
-    log_temperature = nn.Parameter(torch.tensor(0.0))
-    optimiser = torch.optim.Adam([log_temperature], 0.05)
+    duals = Duals(temperature=1.0)
+    optimiser = duals.adam(0.05)
     for _ in range(300):
-        weights, loss = weights_and_temperature_loss(q, 0.1, log_temperature.exp())
+        better = improve(q, torch.full_like(q, -math.log(500)), duals["temperature"], 0.1, dim=0)
         optimiser.zero_grad()
-        loss.backward()
+        better.temperature_loss.backward()
         optimiser.step()
-    assert float(nonparametric_kl(weights).mean()) == pytest.approx(0.1, rel=0.05)
+    assert float(better.kl) == pytest.approx(1.0, rel=0.05)
     # For Q ~ N(0, 1) the reweighted distribution is N(1 / eta, 1), whose KL is 1 / (2 eta^2).
-    assert float(log_temperature.detach().exp()) == pytest.approx(math.sqrt(5), rel=0.1)
+    assert duals["temperature"].item() == pytest.approx(math.sqrt(5), rel=0.1)
 
 
-def test_densities_and_divergences_agree_with_torch():
-    mean, scale = torch.tensor([[0.1, -0.2]]), torch.tensor([[0.5, 1.5]])
-    other_mean, other_scale = torch.tensor([[0.3, 0.4]]), torch.tensor([[0.9, 0.8]])
-    p, q = torch.distributions.Normal(mean, scale), torch.distributions.Normal(other_mean, other_scale)
-    expected = torch.distributions.kl_divergence(p, q)
-    assert torch.allclose(gaussian_kl(mean, scale, other_mean, other_scale), expected)
-    action = torch.randn(7, 1, 2)
-    assert torch.allclose(gaussian_log_prob(action, mean, scale), p.log_prob(action).sum(-1), atol=1e-5)
+def test_kl_is_reported_for_each_dimension():
+    online = torch.tensor([[0.1, 0.0]]), torch.tensor([[0.5, 1.0]])
+    target = torch.tensor([[0.0, 0.0]]), torch.tensor([[0.5, 0.8]])
+    _, stats = MPOLoss(2)(online, target, torch.randn(3, 1, 2), torch.randn(3, 1))
+    logged = scalars(stats._asdict())
+    # (0.1 / 0.5)^2 / 2 = 0.02, which is 8 times 0.0025.
+    assert logged["mpo/kl_mean/0"] == pytest.approx(8.0) and logged["mpo/kl_mean/1"] == 0.0
+    assert logged["mpo/kl_scale/0"] == 0.0 and logged["mpo/kl_scale/1"] > 1.0
+    assert logged["mpo/kl_mean"] == pytest.approx(4.0)
+
+
+def test_dual_variables_begin_where_they_are_told_and_stay_where_they_can_be_learned():
+    duals = Duals(small=0.01, large=1000.0, each=torch.tensor([1.0, 10.0]))
+    for name, value in (("small", [0.01]), ("large", [1000.0]), ("each", [1.0, 10.0])):
+        assert duals[name].flatten().tolist() == pytest.approx(value, rel=1e-5)
+    optimiser = duals.adam(100.0)
+    for _ in range(30):
+        optimiser.zero_grad()
+        sum(duals[name].sum() for name in ("small", "large", "each")).backward()
+        optimiser.step()
+    assert all(p.min() >= -18.0 and (duals.raw[k].grad is not None) for k, p in duals.raw.items())
+    assert all((duals[name] > 0).all() for name in duals.raw)
 
 
 def test_only_actions_outside_the_box_cost():

@@ -1,15 +1,10 @@
 import pytest
 import torch
 
-from mujoban_rl.mpo_discrete import (
-    DiscreteMPO,
-    DiscreteMPOConfig,
-    expected_value,
-    improved_policy,
-    kl_divergence,
-    temperature_dual,
-)
-from mujoban_rl.replay import TimeMajorReplay, windowed_returns
+from mujoban_rl.losses.mpo import improve
+from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
+from mujoban_rl.losses.returns import windowed_returns
+from mujoban_rl.replay import TimeMajorReplay
 
 # A walk on 6 cells with 5 actions (left, right, stay, stay, stay): +1 at the right end. gamma = 0.9.
 STATES, ACTIONS, GAMMA = 6, 5, 0.9
@@ -53,20 +48,22 @@ def test_temperature_that_minimises_the_dual_puts_the_improved_policy_on_its_con
     q = torch.randn(64, ACTIONS, generator=generator)
     log_prior = torch.log_softmax(torch.randn(64, ACTIONS, generator=generator), 1)
     mpo = DiscreteMPO()
-    adam = torch.optim.Adam([mpo.log_temperature], 0.1)
+    adam = mpo.duals.adam(0.1)
     for _ in range(600):
-        loss = temperature_dual(q, log_prior, mpo.temperature, 0.1)
+        better = improve(q, log_prior, mpo.duals["temperature"], 0.1, dim=1)
         adam.zero_grad()
-        loss.backward()
+        better.temperature_loss.backward()
         adam.step()
-    improved = improved_policy(q, log_prior, mpo.temperature.detach())
-    assert kl_divergence(improved.log(), log_prior).mean().item() == pytest.approx(0.1, rel=0.02)
+    improved, prior = torch.distributions.Categorical(better.weights), torch.distributions.Categorical(logits=log_prior)
+    assert torch.distributions.kl_divergence(improved, prior).mean().item() == pytest.approx(0.1, rel=0.02)
+    assert better.kl.item() == pytest.approx(1.0, rel=0.02)
 
 
 def test_improved_policy_is_the_closed_form():
     q, log_prior = torch.tensor([[1.0, 2.0, 0.0]]), torch.tensor([[0.5, 0.25, 0.25]]).log()
     weights = torch.tensor([0.5 * 2.718281828**0.5, 0.25 * 2.718281828**1.0, 0.25])
-    assert torch.allclose(improved_policy(q, log_prior, torch.tensor(2.0))[0], weights / weights.sum(), atol=1e-6)
+    improved = improve(q, log_prior, torch.tensor(2.0), 0.1, dim=1).weights[0]
+    assert torch.allclose(improved, weights / weights.sum(), atol=1e-6)
 
 
 def test_only_the_online_policy_and_the_dual_variables_are_trained():
@@ -74,7 +71,7 @@ def test_only_the_online_policy_and_the_dual_variables_are_trained():
     mpo = DiscreteMPO()
     mpo(logits, target, q)[0].backward()
     assert logits.grad is not None and target.grad is None and q.grad is None
-    assert mpo.log_temperature.grad is not None and mpo.log_alpha.grad is not None
+    assert all(variable.grad is not None for variable in mpo.duals.parameters())
 
 
 def test_contradictory_configuration_is_rejected():
