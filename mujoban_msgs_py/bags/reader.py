@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from mujoban_msgs_py import conversions
+from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.metadata import FILE_NAME, Metadata
 from mujoban_msgs_py.bags.storage import Damage, McapFile, RawMessage, SqliteBag, Storage, TopicInfo
