@@ -1,0 +1,124 @@
+"""Batches from a replay that actors fill while a learner learns from it (paper C.5)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from torch import Tensor
+
+from mujoban_rl.actors.actor import Experience
+from mujoban_rl.actors.pool import ActorPool
+from mujoban_rl.engine import Scalars, Source, State
+
+BatchT = TypeVar("BatchT")
+_BatchT_co = TypeVar("_BatchT_co", covariant=True)
+
+
+class ExperienceStore(Protocol[_BatchT_co]):
+    """A replay, as a source sees it."""
+
+    def add(self, experience: Experience) -> None:
+        """Take in what an actor delivered; its arrays may be read-only, and are not kept alive by anybody else."""
+
+    def sample(self) -> _BatchT_co:
+        """Return a batch to learn from."""
+        ...
+
+    def state(self) -> State:
+        """Return all that changes: contents, or nothing where a resumed run fills it anew, and randomness."""
+        ...
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+
+
+class ActorSource(Source[BatchT], Generic[BatchT]):
+    """Collects so many steps of actors for every update of the learner, however fast either of them is.
+
+    The paper keeps this ratio the same by the number of actors that it gives to each module; here whoever is ahead
+    waits for the other.
+    """
+
+    def __init__(
+        self, pool: ActorPool, store: ExperienceStore[BatchT], *, steps_per_update: float, first_steps: int = 0
+    ) -> None:
+        """Draw batches from a store that a pool fills.
+
+        Args:
+            pool: The actors.
+            store: The replay.
+            steps_per_update: Environment steps that are collected for each update.
+            first_steps: Environment steps that are collected before the first update, in addition.
+
+        Raises:
+            ValueError: If a number is out of its range.
+        """
+        if not steps_per_update > 0.0 or first_steps < 0:
+            raise ValueError(
+                f"{steps_per_update} steps per update, {first_steps} before: expected more than 0, and at least 0"
+            )
+        self.pool, self.store = pool, store
+        self._ratio, self._first = steps_per_update, first_steps
+        self._updates = 0
+        self._seen: dict[str, list[float]] = {}
+        self._staleness: list[int] = []
+        self._since = time.monotonic(), 0  # when statistics were asked for last, steps since then
+
+    def next_batch(self) -> BatchT:
+        """Return a batch, once the steps that are due for it have come in.
+
+        Raises:
+            ActorError: If an actor raised an error, or dies again and again.
+        """
+        due = self._first + self._ratio * (self._updates + 1)
+        while self.samples < due:
+            self._add(self.pool.collect())
+        self._updates += 1
+        return self.store.sample()
+
+    def _add(self, experience: Experience) -> None:
+        self.store.add(experience)
+        self.samples += experience.steps
+        self._since = self._since[0], self._since[1] + experience.steps
+        self._staleness.append(self._updates - experience.version)
+        for name, values in experience.statistics.items():
+            self._seen.setdefault(name, []).extend(np.ravel(values).tolist())
+
+    def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
+        """Let actors play with these weights from their next sequence on."""
+        self.pool.publish(weights, version)
+
+    def statistics(self) -> Scalars:
+        """Return means of what happened, frames per second, and the age of the weights behind it, in updates."""
+        start, steps = self._since
+        self._since = time.monotonic(), 0
+        values = {name: float(np.mean(seen)) for name, seen in self._seen.items() if seen}
+        values["actors/frames_per_second"] = steps / max(time.monotonic() - start, 1e-9)
+        if self._staleness:
+            values["actors/staleness"] = float(np.mean(self._staleness))
+            values["actors/staleness_max"] = float(max(self._staleness))
+        values["actors/restarts"] = float(self.pool.restarts)
+        self._seen, self._staleness = {}, []
+        return values
+
+    def worker_cpu_seconds(self) -> float:
+        """Return the CPU time of the actors' processes, as far as they have delivered."""
+        return self.pool.cpu_seconds
+
+    def state(self) -> State:
+        """Return the state of pool and store."""
+        own = State({"updates": self._updates})
+        return State.of({"own": own, "pool": self.pool.state(), "store": self.store.state()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._updates = state.part("own").values["updates"]
+        self.pool.restore(state.part("pool"))
+        self.store.restore(state.part("store"))
+
+    def close(self) -> None:
+        """End the actors."""
+        self.pool.close()
