@@ -168,8 +168,8 @@ def episodes_from(arguments: argparse.Namespace) -> Episodes:
     episodes = Episodes(
         arguments.episodes, arguments.seed, difficulty=arguments.difficulty, level_file=arguments.levels
     )
-    if episodes.levels is not None:
-        for index in np.flatnonzero(solve_levels(episodes.levels).status == Status.UNSOLVABLE):
+    if episodes.source.levels:
+        for index in np.flatnonzero(solve_levels(episodes.source.levels).status == Status.UNSOLVABLE):
             print(f"level {index} of {arguments.levels} is unsolvable; it is played all the same", file=sys.stderr)
     return episodes
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from os import PathLike
 from typing import Any, Final, Literal
 
@@ -17,9 +16,9 @@ from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, CONTROL_PERIOD, DIFFICULTIES, GRID_SIZE
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
-from mujoban_sokoban.episodes import EpisodeSpec
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
-from mujoban_sokoban.levels import Level, read_levels
+from mujoban_sokoban.episodes import EpisodeSpec, LevelSource
+from mujoban_sokoban.generator import TRAIN_SEEDS
+from mujoban_sokoban.levels import Level
 
 Observations = dict[str, Any]
 """Arrays by name."""
@@ -64,45 +63,6 @@ def observation_space(names: tuple[str, ...], body: Body, max_boxes: int) -> spa
         "abstract_state": spaces.Box(0.0, 1.0, (GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32),
     }
     return spaces.Dict({name: known[name] for name in names})
-
-
-@dataclass(frozen=True)
-class LevelSource:
-    """Turns an episode's seed into its level: a generated one, or one of a file.
-
-    Attributes:
-        difficulty: 1 to 5, of generated levels.
-        levels: levels of a file; the episode with seed s plays number s modulo their count. Empty: generate.
-    """
-
-    difficulty: int
-    levels: tuple[Level, ...] = ()
-
-    @classmethod
-    def make(cls, difficulty: int, level_file: str | PathLike[str] | None) -> LevelSource:
-        """Check the options and read the file.
-
-        Raises:
-            ValueError: if the difficulty is unknown or the file is malformed or empty.
-            OSError: if it cannot be read.
-        """
-        if difficulty not in DIFFICULTIES:
-            raise ValueError(f"unknown difficulty {difficulty!r}: expected one of {', '.join(map(str, DIFFICULTIES))}")
-        levels = () if level_file is None else tuple(read_levels(level_file))
-        if level_file is not None and not levels:
-            raise ValueError(f"level file {level_file} has no level: expected at least one")
-        return cls(difficulty, levels)
-
-    @property
-    def max_boxes(self) -> int:
-        """The most boxes of any level."""
-        return max((len(level.boxes) for level in self.levels), default=DIFFICULTIES[self.difficulty][1])
-
-    def episode(self, seed: int) -> EpisodeSpec:
-        """Return the episode with a given seed."""
-        if self.levels:
-            return EpisodeSpec(self.levels[seed % len(self.levels)], seed)
-        return EpisodeSpec(generate_level(self.difficulty, seed), seed)
 
 
 def draw_seed(generator: np.random.Generator) -> int:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_sim.env import (
     RENDER_SIZE,
-    LevelSource,
     MujobanEnv,
     Observations,
     ObservationSet,
@@ -27,6 +26,7 @@ from mujoban_sim.env import (
 )
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
+from mujoban_sokoban.episodes import LevelSource
 
 
 class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):

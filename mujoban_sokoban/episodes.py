@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from typing import overload
 
@@ -31,6 +31,45 @@ def after_moves(level: Level, moves: Iterable[int]) -> Level:
     for move in moves:
         boxes, player, *_ = apply(level.wall, level.target, boxes, player, int(move))
     return replace(level, boxes=boxes, player=(int(player[0]), int(player[1])))
+
+
+@dataclass(frozen=True)
+class LevelSource:
+    """Turns an episode's seed into its level: a generated one, or one of a file.
+
+    Attributes:
+        difficulty: 1 to 5, of generated levels.
+        levels: Levels of a file; the episode with seed s plays number s modulo their count. Empty: generate.
+    """
+
+    difficulty: int
+    levels: tuple[Level, ...] = ()
+
+    @classmethod
+    def make(cls, difficulty: int, level_file: str | PathLike[str] | None) -> LevelSource:
+        """Check the options and read the file, which is in the Boxoban format.
+
+        Raises:
+            ValueError: If the difficulty is unknown or the file is malformed or empty.
+            OSError: If it cannot be read.
+        """
+        if difficulty not in DIFFICULTIES:
+            raise ValueError(f"unknown difficulty {difficulty!r}: expected one of {', '.join(map(str, DIFFICULTIES))}")
+        levels = () if level_file is None else tuple(read_levels(level_file))
+        if level_file is not None and not levels:
+            raise ValueError(f"level file {level_file} has no level: expected at least one")
+        return cls(difficulty, levels)
+
+    @property
+    def max_boxes(self) -> int:
+        """The most boxes of any level."""
+        return max((len(level.boxes) for level in self.levels), default=DIFFICULTIES[self.difficulty][1])
+
+    def episode(self, seed: int) -> EpisodeSpec:
+        """Return the episode with a given seed."""
+        if self.levels:
+            return EpisodeSpec(self.levels[seed % len(self.levels)], seed)
+        return EpisodeSpec(generate_level(self.difficulty, seed), seed)
 
 
 class LazyEpisodes(Sequence[EpisodeSpec]):
@@ -65,10 +104,9 @@ class LazyEpisodes(Sequence[EpisodeSpec]):
 
 
 class Episodes(LazyEpisodes):
-    """A run of episodes: episode i has seed `seed + i`.
+    """A run of episodes: episode i has seed `seed + i`, and the level that `LevelSource` has for that seed.
 
-    Its level is generated from that seed or, with a level file, is number i of the file, which starts
-    over after its last level. Levels are made when they are first asked for.
+    Levels are made when they are first asked for.
     """
 
     def __init__(
@@ -77,7 +115,7 @@ class Episodes(LazyEpisodes):
         """Describe the run.
 
         Args:
-            count: Number of episodes; None means one, or every level of the file.
+            count: Number of episodes; None means one, or as many as a level file has levels.
             seed: Seed of episode 0, not negative.
             difficulty: 1 to 5, for generated levels.
             level_file: Levels in the Boxoban format.
@@ -87,32 +125,24 @@ class Episodes(LazyEpisodes):
             LevelError: If the level file is malformed.
             OSError: If it cannot be read.
         """
-        if difficulty not in DIFFICULTIES:
-            raise ValueError(f"unknown difficulty {difficulty}: expected one of {', '.join(map(str, DIFFICULTIES))}")
+        self.source = LevelSource.make(difficulty, level_file)
         if seed < 0:
             raise ValueError(f"seed {seed} is negative: expected an integer from 0")
         if count is not None and count < 1:
             raise ValueError(f"{count} episodes: expected at least 1")
         self.level_file = level_file
-        self.levels = None if level_file is None else tuple(read_levels(level_file))
         self.seed = seed
-        self._difficulty = difficulty
-        super().__init__(count if count is not None else len(self.levels or (None,)))
+        super().__init__(count if count is not None else max(len(self.source.levels), 1))
 
     @property
     def difficulty(self) -> int:
         """Difficulty of generated levels; 0 stands for levels from a file."""
-        return self._difficulty if self.levels is None else 0
+        return 0 if self.source.levels else self.source.difficulty
 
-    @cached_property
+    @property
     def max_boxes(self) -> int:
         """Most boxes that any level of the run has."""
-        if self.levels is None:
-            return DIFFICULTIES[self._difficulty][1]
-        return max(len(level.boxes) for level in self.levels)
+        return self.source.max_boxes
 
     def _make(self, index: int) -> EpisodeSpec:
-        seed = self.seed + index
-        if self.levels is None:
-            return EpisodeSpec(generate_level(self._difficulty, seed), seed)
-        return EpisodeSpec(self.levels[index % len(self.levels)], seed)
+        return self.source.episode(self.seed + index)

@@ -10,6 +10,7 @@ import mujoban_sim  # noqa: F401 - registers the environment
 from mujoban_sim.env import OBSERVATION_SETS, MujobanEnv
 from mujoban_sim.vector_env import MujobanVectorEnv
 from mujoban_sim.world import TorqueError
+from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import TEST_SEEDS, generate_level
 from mujoban_sokoban.levels import Level
 
@@ -74,6 +75,8 @@ def test_levels_come_from_a_file(tmp_path):
     env = MujobanEnv(level_file=path, observations="state")
     assert env.reset(seed=2)[1]["level"] == Level.from_text(CORRIDOR).to_text()
     assert env.reset(seed=3)[1]["level"] != Level.from_text(CORRIDOR).to_text()
+    played = [episode.level.to_text() for episode in Episodes(2, 3, level_file=path)]
+    assert played == [env.reset(seed=seed)[1]["level"] for seed in (3, 4)]
 
 
 def test_bad_options_and_actions_are_named():
