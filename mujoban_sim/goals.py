@@ -51,36 +51,29 @@ _ARRAYS: Final = (
 @njit(cache=True, nogil=True)
 def is_completed(
     kind: int,
-    robot_offset: tuple[float, float],
-    box_offset: tuple[float, float],
+    robot_target: NDArray[np.float64],
+    box_target: NDArray[np.float64],
+    robot: tuple[float, float],
+    box: tuple[float, float],
     box_speed: float,
     tolerance: float,
     max_box_speed: float,
 ) -> bool:
-    """Return whether a goal is reached; offsets from the targets, tolerance and speeds in metres (per second)."""
+    """Return whether a goal is reached.
+
+    Args:
+        kind: A `GoalKind`.
+        robot_target: Of the `GoalTracker`, [2].
+        box_target: The same, [2].
+        robot: Position in the map frame [m].
+        box: Position of the box to be pushed [m].
+        box_speed: Its speed [m/s].
+        tolerance: Of the `GoalTracker` [m].
+        max_box_speed: The same [m/s].
+    """
     if kind == _PUSH:
-        return np.hypot(box_offset[0], box_offset[1]) < tolerance and box_speed < max_box_speed
-    return kind != _NONE and np.hypot(robot_offset[0], robot_offset[1]) < tolerance
-
-
-@njit(cache=True, nogil=True)
-def _check(
-    kind: NDArray[np.int64],
-    robot_target: NDArray[np.float64],
-    box_index: NDArray[np.int64],
-    box_target: NDArray[np.float64],
-    robot_position: NDArray[np.floating],
-    box_position: NDArray[np.floating],
-    box_speed: NDArray[np.floating],
-    tolerance: float,
-    max_box_speed: float,
-    reached: NDArray[np.bool_],
-) -> None:
-    for b in range(kind.shape[0]):
-        k = box_index[b]
-        robot = (robot_position[b, 0] - robot_target[b, 0], robot_position[b, 1] - robot_target[b, 1])
-        box = (box_position[b, k, 0] - box_target[b, 0], box_position[b, k, 1] - box_target[b, 1])
-        reached[b] = is_completed(kind[b], robot, box, box_speed[b, k], tolerance, max_box_speed)
+        return np.hypot(box[0] - box_target[0], box[1] - box_target[1]) < tolerance and box_speed < max_box_speed
+    return kind != _NONE and np.hypot(robot[0] - robot_target[0], robot[1] - robot_target[1]) < tolerance
 
 
 class GoalTracker:
@@ -94,7 +87,8 @@ class GoalTracker:
         robot_target: centre of `goal_cell` in the map frame [m], float64 [B, 2].
         box_index: the box to be pushed, int64 [B]; 0 unless `kind` is PUSH.
         box_target: where it is to be pushed in the map frame [m], float64 [B, 2]; meaningless unless PUSH.
-        reached: result of the last check, bool [B]; false since the instruction was issued until one is made.
+        reached: result of the last check by `is_completed`, bool [B], which the world makes after every step; false
+            since the instruction was issued until one is made.
     """
 
     def __init__(
@@ -174,22 +168,3 @@ class GoalTracker:
         """Take over a copy of the arrays that `memory` returned."""
         for name, values in zip(_ARRAYS, memory, strict=True):
             getattr(self, name)[:] = values
-
-    def completed(
-        self,
-        robot_position: NDArray[np.floating],
-        box_position: NDArray[np.floating],
-        box_speed: NDArray[np.floating],
-    ) -> NDArray[np.bool_]:
-        """Check and return which instructions in force are completed, [B].
-
-        Args:
-            robot_position: in the map frame [m], [B, 2] or more columns, of which the first two count.
-            box_position: in the map frame [m], [B, K, 2].
-            box_speed: [m/s], [B, K].
-        """
-        _check(
-            self.kind, self.robot_target, self.box_index, self.box_target,
-            robot_position, box_position, box_speed, self.tolerance, self.max_box_speed, self.reached,
-        )  # fmt: skip
-        return self.reached

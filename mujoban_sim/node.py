@@ -18,6 +18,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
+from mujoban_core.files import write_atomically
 from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
@@ -185,9 +186,7 @@ class SimulatorNode(Node):
     def _write_progress(self) -> None:
         path = self._settings["progress_file"]
         if path:
-            partial = Path(path + ".partial")
-            partial.write_text(json.dumps(self._progress._asdict()))
-            partial.replace(path)
+            write_atomically(Path(path), json.dumps(self._progress._asdict()).encode())
 
     # Ticks
 

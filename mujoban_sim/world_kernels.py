@@ -210,13 +210,11 @@ def update(rows: NDArray[np.int64], advance: bool, state: KernelState) -> bool:
         )  # fmt: skip
         _locate_agent(qpos[root], qpos[root + 1], cell_size, state.box_cell[b], state.agent_cell[b])
         _mark(state.abstract_state[b], state.agent_cell[b], state.box_cell[b], 1.0)
-        k = BOX_COORDINATES * state.box_index[b]
-        robot_offset = (qpos[root] - state.robot_target[b, 0], qpos[root + 1] - state.robot_target[b, 1])
-        box_offset = (qpos[k] - state.box_target[b, 0], qpos[k + 1] - state.box_target[b, 1])
-        speed = float(np.hypot(qvel[k], qvel[k + 1]))
+        k = int(BOX_COORDINATES * state.box_index[b])
         state.reached[b] = is_completed(
-            int(state.kind[b]), robot_offset, box_offset, speed, state.tolerance, state.max_box_speed
-        )
+            int(state.kind[b]), state.robot_target[b], state.box_target[b], (qpos[root], qpos[root + 1]),
+            (qpos[k], qpos[k + 1]), float(np.hypot(qvel[k], qvel[k + 1])), state.tolerance, state.max_box_speed,
+        )  # fmt: skip
         if not advance:
             continue
         state.steps[b] += 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, Final
 
 import yaml
 
+from mujoban_core.files import write_atomically
 from mujoban_msgs_py.bags.errors import BagError
 
 FILE_NAME: Final = "metadata.yaml"
@@ -74,12 +74,9 @@ class Metadata:
 
     def write(self, folder: Path) -> None:
         """Replace the file in `folder` atomically."""
-        partial = folder / (FILE_NAME + ".partial")
-        with partial.open("w") as stream:
-            yaml.dump({_KEY: self._information()}, stream, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(folder / FILE_NAME)
+        content = {_KEY: self._information()}
+        text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
+        write_atomically(folder / FILE_NAME, text.encode())
 
     @classmethod
     def read(cls, folder: Path) -> Metadata | None:
