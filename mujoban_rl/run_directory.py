@@ -140,6 +140,7 @@ class RunDirectory:
             for name, optimiser in (optimisers or {}).items():
                 state = _join_optimiser(_below(flat, f"optimiser/{name}/"), content["optimisers"][name])
                 optimiser.load_state_dict(state)
+                _lay_out(optimiser)
             return Snapshot(content["step"], content["extra"], _below(flat, "tensor/"))
         if candidates:
             raise RunError(f"{self.path}: none of {len(candidates)} checkpoints is intact")
@@ -163,6 +164,14 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | N
 
 def _below(flat: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in flat.items() if k.startswith(prefix)}
+
+
+def _lay_out(optimiser: torch.optim.Optimizer) -> None:
+    """Lay moments out in memory as the parameters are, which may be channels-last: fused optimisers rely on it."""
+    for parameter, moments in optimiser.state.items():
+        for key, value in moments.items():
+            if isinstance(value, Tensor) and value.shape == parameter.shape:
+                moments[key] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
 
 
 def _split_optimiser(state: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -44,6 +44,27 @@ def test_resumed_training_equals_uninterrupted_training(tmp_path):
     assert torch.equal(net.layer.weight, again.layer.weight)
 
 
+def test_moments_come_back_in_the_layout_of_their_parameters_which_fused_optimisers_rely_on(tmp_path):
+    def make():
+        torch.manual_seed(0)
+        net = nn.Conv2d(3, 4, 3).to(memory_format=torch.channels_last)
+        return net, torch.optim.AdamW(net.parameters(), 1e-2, fused=True)
+
+    def fit(net, adam):
+        adam.zero_grad()
+        net(torch.arange(75.0).view(1, 3, 5, 5).sin()).square().sum().backward()
+        adam.step()
+
+    net, adam = make()
+    fit(net, adam)
+    RunDirectory(tmp_path, {}).save(1, modules={"net": net}, optimisers={"adam": adam})
+    again, adam2 = make()
+    RunDirectory(tmp_path, {}).load(modules={"net": again}, optimisers={"adam": adam2})
+    fit(net, adam)
+    fit(again, adam2)
+    assert torch.equal(net.weight, again.weight)
+
+
 def test_damaged_newest_checkpoint_falls_back_to_the_one_before(tmp_path):
     net, _adam = _make()
     run = RunDirectory(tmp_path, {})
