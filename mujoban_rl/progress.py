@@ -6,7 +6,7 @@ import math
 import resource
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True)
@@ -17,12 +17,14 @@ class Budget:
     updates: float = math.inf
     seconds: float = math.inf
     """Wall-clock seconds of training; makes schedules, and so the run, depend on the machine."""
+    cpu_seconds: float = math.inf
+    """CPU seconds of all processes of the run; depends on the machine too, but not on what else runs there."""
 
     def __post_init__(self) -> None:
         """Reject budgets that are no amounts."""
-        for name in ("samples", "updates", "seconds"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"budget of {getattr(self, name)} {name}: expected a positive number")
+        for amount in fields(self):
+            if not getattr(self, amount.name) > 0:
+                raise ValueError(f"budget of {getattr(self, amount.name)} {amount.name}: expected a positive number")
 
 
 @dataclass
@@ -38,7 +40,7 @@ class Progress:
 
     def share(self, budget: Budget) -> float:
         """Return the share of the budget that is spent."""
-        return max(self.samples / budget.samples, self.updates / budget.updates, self.seconds / budget.seconds)
+        return max(getattr(self, spent.name) / getattr(budget, spent.name) for spent in fields(budget))
 
 
 class Clock:
