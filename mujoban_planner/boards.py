@@ -59,6 +59,26 @@ def bit_boards(levels: LevelBatch) -> BitBoards:
     return BitBoards(pack_boards(levels.wall), pack_boards(levels.target), box, agent.astype(np.uint8))
 
 
+def level_batch(boards: BitBoards) -> LevelBatch:
+    """Return states as levels; boxes in the order of their squares, K the most that any has."""
+    wall = np.ones((len(boards.agent), GRID_SIZE, GRID_SIZE), np.bool_)
+    target = np.zeros_like(wall)
+    wall[:, 1:-1, 1:-1], target[:, 1:-1, 1:-1] = _unpack(boards.wall), _unpack(boards.target)
+    level, row, column = np.nonzero(_unpack(boards.box))
+    counts = np.bincount(level, minlength=len(wall))
+    cells = np.full((len(wall), int(counts.max(initial=1)), 2), -1, np.int64)
+    index = np.arange(len(level)) - np.repeat(np.cumsum(counts) - counts, counts)
+    cells[level, index] = np.stack([row + 1, column + 1], -1)
+    agent = boards.agent.astype(np.int64)
+    return LevelBatch(wall, target, cells, np.stack([agent // SIDE + 1, agent % SIDE + 1], -1))
+
+
+def _unpack(boards: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Return boards [M] as layers, [M, I, I]."""
+    octets = np.ascontiguousarray(boards, "<u8").view(np.uint8).reshape(-1, SIDE)
+    return np.unpackbits(octets, axis=1, bitorder="little").reshape(-1, SIDE, SIDE).astype(np.bool_)
+
+
 def likeliest_boards(abstract_state: NDArray[np.float32]) -> BitBoards:
     """Return the likeliest boards of abstract states, [M, N, N, 4]; nothing stands in a wall or in the robot's cell."""
     certain = abstract_state > 0.5
@@ -82,6 +102,11 @@ def state_tensor(boards: BitBoards, symmetry: NDArray[np.int64] | None = None) -
     state = np.zeros((n, GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32)
     _fill_states(*boards, np.zeros(n, np.int64) if symmetry is None else symmetry, cell_sources(SIDE), state)
     return torch.from_numpy(state)
+
+
+def signed(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a view of an array as a type that tensors and their files have: boards as int64."""
+    return array.view(np.int64) if array.dtype == np.uint64 else array
 
 
 def _box_layer(levels: LevelBatch) -> NDArray[np.bool_]:

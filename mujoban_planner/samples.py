@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_core.grid import Instruction
-from mujoban_planner.boards import BitBoards, state_tensor
+from mujoban_planner.boards import BitBoards, signed, state_tensor
 from mujoban_planner.symmetry import SYMMETRIES, cell_sources, instruction_map
+from mujoban_rl.engine import State
 from mujoban_sokoban.bitboard import SIDE, SQUARES
 
 EVERY_INSTRUCTION = (1 << len(Instruction)) - 1
@@ -130,6 +131,18 @@ class SampleBuffer:
     def draw(self, n: int, rng: np.random.Generator) -> Samples:
         """Return `n` random samples, with replacement."""
         return self.storage.take(rng.integers(0, self.size, n))
+
+    def state(self) -> State:
+        """Return what the buffer holds."""
+        columns = self.storage._asdict().items()
+        return State({"added": self.added}, {k: torch.from_numpy(signed(v[: self.size])) for k, v in columns})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self.added = state.values["added"]
+        self.size = min(self.added, self.capacity)
+        for name, column in self.storage._asdict().items():
+            signed(column)[: self.size] = state.tensors[name].numpy()
 
 
 def make_batch(samples: Samples, symmetry: NDArray[np.int64]) -> Batch:

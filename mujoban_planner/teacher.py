@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mujoban_core.grid import GRID_SIZE, OFFSETS_RC, Instruction
 from mujoban_planner.boards import BitBoards, bit_boards, take_levels
 from mujoban_planner.samples import EVERY_INSTRUCTION, Samples, concatenate, unlabelled
-from mujoban_sokoban.bitboard import SIDE, SQUARE_STEP, SQUARES, bit, flood, shift
+from mujoban_sokoban.bitboard import SIDE, SQUARE_STEP, SQUARES, bit, flood, pushable
 from mujoban_sokoban.levels import LevelBatch
 from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD
 from mujoban_sokoban.solver import ABSENT, Demonstrations, Status, demonstrations, solve_batch
@@ -31,7 +31,7 @@ HOPELESS: Final = STEP_REWARD / (1.0 - DISCOUNT)
 """Return where nothing but the cost of moving is left."""
 _QUICK_WEIGHT: Final = 2.0
 """Weight of the solver's heuristic where only solvability matters."""
-_DEAD_SHARE: Final = 0.05
+DEAD_SHARE: Final = 0.05
 """Share of the dead states behind judged pushes that become samples of their own; there are many."""
 
 
@@ -60,18 +60,18 @@ class Teacher:
         """
         found = demonstrations(levels, rng=rng, max_nodes=self.max_nodes)
         dead = take_levels(levels, found.status == Status.UNSOLVABLE)
-        parts = [_label_dead(bit_boards(dead))]
+        parts = [label_dead(bit_boards(dead))]
         if len(found.level):
             first = np.searchsorted(found.level, found.level)  # Shape [S], where each state's demonstration begins
             kept = np.ones(len(first), np.bool_) if keep is None else np.arange(len(first)) - first < keep
-            samples, upcoming = _label_demonstrations(levels, found)
+            samples, upcoming = label_demonstrations(levels, found)
             pushes = np.unique(upcoming[kept])
             pushes = pushes[rng.random(len(pushes)) < judged]
             lost = self._judge_pushes(levels, found, samples, pushes)
             # Until the next push the boxes stay where they are, and so do the verdicts.
             samples.push_known[:], samples.push_dead[:] = samples.push_known[upcoming], samples.push_dead[upcoming]
             shown = samples.take(kept)
-            parts += [_judge_instructions(shown), lost.take(rng.random(len(lost.agent)) < _DEAD_SHARE)]
+            parts += [judge_instructions(shown), lost.take(rng.random(len(lost.agent)) < DEAD_SHARE)]
         return concatenate(parts)
 
     def _judge_pushes(
@@ -89,7 +89,7 @@ class Teacher:
         decided, lost = status != Status.BUDGET, status == Status.UNSOLVABLE
         np.bitwise_or.at(samples.push_known, (rows[state[decided]], direction[decided]), board[decided])
         np.bitwise_or.at(samples.push_dead, (rows[state[lost]], direction[lost]), board[lost])
-        return _label_dead(bit_boards(take_levels(pushed, lost)))
+        return label_dead(bit_boards(take_levels(pushed, lost)))
 
 
 def label_deadly(levels: LevelBatch, instruction: NDArray[np.int64]) -> Samples:
@@ -103,7 +103,8 @@ def label_deadly(levels: LevelBatch, instruction: NDArray[np.int64]) -> Samples:
     return samples._replace(dead_known=mask | np.uint8(1 << Instruction.STAY), dead=mask)
 
 
-def _label_dead(boards: BitBoards) -> Samples:
+def label_dead(boards: BitBoards) -> Samples:
+    """Return samples that say that no solution is left in these states, nor after any instruction."""
     samples = unlabelled(boards)
     every = np.full(len(boards.agent), EVERY_INSTRUCTION, np.uint8)
     value = np.full(len(boards.agent), HOPELESS, np.float32)
@@ -131,7 +132,7 @@ def _push(levels: LevelBatch, square: NDArray[np.int64], direction: NDArray[np.i
     return levels._replace(boxes=boxes, player=cell)
 
 
-def _label_demonstrations(levels: LevelBatch, found: Demonstrations) -> tuple[Samples, NDArray[np.int64]]:
+def label_demonstrations(levels: LevelBatch, found: Demonstrations) -> tuple[Samples, NDArray[np.int64]]:
     """Return the samples of demonstrations, and the row in which the next push of each is executed, [S]."""
     rows = np.arange(len(found.level))
     boards = bit_boards(_levels_of(levels, found, rows))
@@ -154,7 +155,7 @@ def _label_demonstrations(levels: LevelBatch, found: Demonstrations) -> tuple[Sa
     return labelled, upcoming
 
 
-def _judge_instructions(samples: Samples) -> Samples:
+def judge_instructions(samples: Samples) -> Samples:
     """Return samples of demonstrations with the verdicts on instructions that follow from those on pushes."""
     pushing = possible_pushes(samples.boards)
     known = EVERY_INSTRUCTION & ~pushing  # Walking loses nothing
@@ -187,7 +188,7 @@ def _fill_reachable(
         free = ~(wall[i] | box[i])
         reached = flood(bit(agent[i]), free)
         for direction in range(4):
-            out[i, direction] = box[i] & shift(reached, direction) & shift(free, (direction + 2) % 4)
+            out[i, direction] = pushable(reached, free, box[i], direction)
 
 
 def possible_pushes(boards: BitBoards) -> NDArray[np.uint8]:

@@ -94,6 +94,18 @@ def flood(start: Bits, free: Bits) -> Bits:
         reached = grown
 
 
+@njit(cache=True, nogil=True, inline="always")
+def pushable(stands: Bits, free: Bits, boxes: Bits, direction: Int) -> Bits:
+    """Return the boxes that can be pushed in a direction: from a square of `stands` behind them into one of `free`."""
+    return shift(stands, direction) & boxes & shift(free, (direction + 2) % 4)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def pushed(boxes: Bits, square: Int, direction: Int) -> Bits:
+    """Return the boxes after the one on a square was pushed."""
+    return (boxes ^ bit(square)) | bit(square + SQUARE_STEP[direction])
+
+
 @njit(cache=True, nogil=True)
 def frozen(boxes: Bits, wall: Bits, dead: Bits) -> Bits:
     """Return the boxes that can never move again.

@@ -19,7 +19,7 @@ from mujoban_core.grid import GRID_SIZE, Instruction
 from mujoban_sokoban import solver_search
 from mujoban_sokoban.bitboard import to_square
 from mujoban_sokoban.levels import Level, LevelBatch, stack_levels
-from mujoban_sokoban.solver_labels import label_batch, moves_of, search_batch, squares_of
+from mujoban_sokoban.solver_labels import count_moves, label_batch, moves_of, search_batch, squares_of
 from mujoban_sokoban.solver_search import make_workspace
 
 MAX_NODES: Final = 250_000
@@ -165,6 +165,30 @@ def demonstrations(
     """
     batch = _checked(batch)
     return _label(batch, _solve(batch, max_nodes, weight), rng, None)
+
+
+def label_solutions(
+    batch: LevelBatch, pushes: Sequence[NDArray[np.uint8]], *, rng: np.random.Generator
+) -> Demonstrations:
+    """Label every state along solutions that are known, however they were found.
+
+    Args:
+        batch: B levels.
+        pushes: Pushes that solve each level, 4 * square + direction of the box, B of [its length], one at least.
+        rng: Chooses among equally short walks.
+
+    Raises:
+        ValueError: As `solve`, or if a level has no pushes.
+    """
+    batch = _checked(batch)
+    if len(pushes) != len(batch.wall) or not all(len(p) for p in pushes):
+        raise ValueError(f"{len(pushes)} solutions of {len(batch.wall)} levels: expected one push at least for each")
+    first = np.concatenate([[0], np.cumsum([len(p) for p in pushes])]).astype(np.int64)
+    flat = np.concatenate([np.zeros(0, np.uint8), *pushes])
+    length, nodes = np.zeros((2, len(pushes)), np.int64)
+    count_moves(batch.wall, batch.boxes, batch.player, flat, first, length)
+    status = np.full(len(pushes), Status.SOLVED, np.int64)
+    return _label(batch, _Solved(Solutions(status, length, np.diff(first), nodes), flat, first), rng, None)
 
 
 def label_states(batch: LevelBatch, *, max_nodes: int = MAX_NODES, weight: float = 1.0) -> Labels:

@@ -19,6 +19,7 @@ from mujoban_sokoban.bitboard import (
     bit,
     from_grid,
     lowest,
+    pushed,
     shift,
     spread,
     to_square,
@@ -87,8 +88,30 @@ def moves_of(
             player += SQUARE_STEP[step]
         moves[written] = direction + 1
         written += 1
-        boxes = (boxes ^ bit(square)) | bit(square + SQUARE_STEP[direction])
+        boxes = pushed(boxes, square, direction)
         player = square
+
+
+@njit(cache=True, nogil=True)
+def count_moves(
+    wall: NDArray[np.bool_],
+    boxes: NDArray[np.int64],
+    player: NDArray[np.int64],
+    pushes: NDArray[np.uint8],
+    first: NDArray[np.int64],
+    moves: NDArray[np.int64],
+) -> None:
+    """Write the moves of B solutions, walks included; the pushes of level i go from `first[i]` to `first[i + 1]`."""
+    distance = np.empty(SQUARES, np.int8)
+    for i in range(len(wall)):
+        floor, occupied = from_grid(~wall[i]), squares_of(boxes[i])
+        at = to_square(player[i, 0], player[i, 1])
+        for push in pushes[first[i] : first[i + 1]]:
+            square, direction = np.int64(push) // 4, np.int64(push) % 4
+            walk_distances(at, floor & ~occupied, distance)
+            moves[i] += distance[square - SQUARE_STEP[direction]] + 1
+            occupied = pushed(occupied, square, direction)
+            at = square
 
 
 @njit(cache=True, nogil=True)
@@ -199,7 +222,7 @@ def label_solution(
                 break
             at += SQUARE_STEP[_choose(mask, rng)]
         landing = square + SQUARE_STEP[direction]
-        occupied = (occupied ^ bit(square)) | bit(landing)
+        occupied = pushed(occupied, square, direction)
         for k in range(len(boxes)):
             if square_of[k] == square:
                 square_of[k] = landing

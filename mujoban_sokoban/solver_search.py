@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from mujoban_sokoban.bitboard import (
     NONE,
     ONE,
-    SQUARE_STEP,
     SQUARES,
     Bits,
     Int,
@@ -27,6 +26,8 @@ from mujoban_sokoban.bitboard import (
     count,
     frozen,
     lowest,
+    pushable,
+    pushed,
     shift,
     spread,
 )
@@ -285,11 +286,11 @@ def search(
                 break
             cost = np.int64(work.entry_cost[entry]) + walk + 1
             for direction in range(4):
-                pushable = shift(frontier, direction) & here & shift(landing, (direction + 2) % 4)
-                while pushable != NONE:
-                    square = lowest(pushable)
-                    pushable &= pushable - ONE
-                    after = (here ^ bit(square)) | bit(square + SQUARE_STEP[direction])
+                ready = pushable(frontier, landing, here, direction)
+                while ready != NONE:
+                    square = lowest(ready)
+                    ready &= ready - ONE
+                    after = pushed(here, square, direction)
                     slot = _find(work, after, square)
                     child = np.int64(work.table[slot])
                     if child < 0:

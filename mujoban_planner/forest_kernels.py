@@ -1,0 +1,303 @@
+"""The numba kernels behind `mujoban_planner.forest`: nodes, queues and hash tables of many trees.
+
+Shapes: M trees, N nodes of a tree, R rows, X expanded nodes, D = 4 directions, I = 8.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mujoban_sokoban.bitboard import (
+    NONE,
+    ONE,
+    SQUARE_STEP,
+    SQUARES,
+    Bits,
+    Int,
+    bit,
+    count,
+    flood,
+    frozen,
+    lowest,
+    pushable,
+    pushed,
+)
+from mujoban_sokoban.solver_labels import walk_distances
+from mujoban_sokoban.solver_search import dead_squares, push_distances
+
+DEAD_WEIGHT: Final = 1.0
+"""Weight of log p(alive) in a node's cost."""
+_DEAD: Final = -2
+"""In place of a child: the push leads nowhere at sight. -1 stands for a state that no node was made for."""
+
+
+class Trees(NamedTuple):
+    """Memory of M searches."""
+
+    wall: NDArray[np.uint64]
+    """[M]; and so the next two."""
+    target: NDArray[np.uint64]
+    dead: NDArray[np.uint64]
+    """Squares from which no target can be reached, [M]."""
+    box: NDArray[np.uint64]
+    """Boxes of each node, [M, N]."""
+    agent: NDArray[np.uint8]
+    """Square of the robot, [M, N]."""
+    region: NDArray[np.uint8]
+    """Lowest square that the robot can walk to, [M, N]."""
+    cost: NDArray[np.float32]
+    """[M, N]."""
+    logp: NDArray[np.float32]
+    """Log-probability of the pushes that lead to the node, [M, N]."""
+    moves: NDArray[np.int16]
+    """Moves of the way to the node, [M, N]."""
+    depth: NDArray[np.int16]
+    """Pushes of it, [M, N]."""
+    parent: NDArray[np.int32]
+    """[M, N]."""
+    push: NDArray[np.uint8]
+    """4 * square + direction of the push that leads here, [M, N]."""
+    expanded: NDArray[np.bool_]
+    """[M, N]."""
+    heap: NDArray[np.int32]
+    """Nodes that wait, the cheapest first, [M, N]."""
+    table: NDArray[np.int32]
+    """Open-addressing hash table of states: the node with the fewest moves; -1 for free, [M, power of two]."""
+    nodes: NDArray[np.int64]
+    """Number of nodes, [M]."""
+    waiting: NDArray[np.int64]
+    """Number of nodes in the heap, [M]."""
+    solution: NDArray[np.int64]
+    """Node in which the level is solved, -1 while there is none, [M]."""
+    expansions: NDArray[np.int64]
+    """Nodes that were expanded, [M]."""
+
+
+@njit(cache=True, nogil=True)
+def _sift_up(heap: NDArray[np.int32], cost: NDArray[np.float32], size: Int, node: Int) -> None:
+    """Add a node to a heap of `size` nodes."""
+    i = size
+    while i > 0:
+        above = (i - 1) >> 1
+        if cost[heap[above]] <= cost[node]:
+            break
+        heap[i] = heap[above]
+        i = above
+    heap[i] = node
+
+
+@njit(cache=True, nogil=True)
+def _take_first(heap: NDArray[np.int32], cost: NDArray[np.float32], size: Int) -> Int:
+    """Take the cheapest node out of a heap of `size` nodes."""
+    first, node = np.int64(heap[0]), np.int64(heap[size - 1])
+    size -= 1
+    i = 0
+    while 2 * i + 1 < size:
+        child = 2 * i + 1
+        if child + 1 < size and cost[heap[child + 1]] < cost[heap[child]]:
+            child += 1
+        if cost[node] <= cost[heap[child]]:
+            break
+        heap[i] = heap[child]
+        i = child
+    heap[i] = node
+    return first
+
+
+@njit(cache=True, nogil=True)
+def _find(trees: Trees, row: Int, box: Bits, region: Int) -> Int:
+    """Return the slot of a state in a tree's table, or the free slot where it belongs."""
+    mask = np.uint64(trees.table.shape[1] - 1)
+    mixed = (box ^ (np.uint64(region) * np.uint64(0xD6E8FEB86659FD93))) * np.uint64(0x9E3779B97F4A7C15)
+    slot = (mixed ^ (mixed >> np.uint64(32))) & mask
+    while True:
+        node = trees.table[row, slot]
+        if node < 0 or (trees.box[row, node] == box and trees.region[row, node] == region):
+            return np.int64(slot)
+        slot = (slot + ONE) & mask
+
+
+@njit(cache=True, nogil=True)
+def _add(trees: Trees, row: Int, slot: Int, box: Bits, agent: Int, region: Int) -> Int:
+    """Add a node; the caller says how it was reached."""
+    node = trees.nodes[row]
+    trees.nodes[row] += 1
+    trees.box[row, node], trees.agent[row, node], trees.region[row, node] = box, agent, region
+    trees.expanded[row, node] = False
+    trees.table[row, slot] = node
+    return node
+
+
+@njit(cache=True, nogil=True)
+def plant(
+    trees: Trees,
+    rows: NDArray[np.int64],
+    wall: NDArray[np.uint64],
+    target: NDArray[np.uint64],
+    box: NDArray[np.uint64],
+    agent: NDArray[np.uint8],
+) -> None:
+    """Start searches from R states; see `forest.Forest.plant`."""
+    for i in range(len(rows)):
+        row = np.int64(rows[i])
+        trees.table[row] = -1
+        trees.wall[row], trees.target[row] = wall[i], target[i]
+        trees.nodes[row], trees.waiting[row], trees.expansions[row], trees.solution[row] = 0, 0, 0, -1
+        region = lowest(flood(bit(agent[i]), ~wall[i] & ~box[i]))
+        node = _add(trees, row, _find(trees, row, box[i], region), box[i], agent[i], region)
+        trees.cost[row, node], trees.logp[row, node] = 0.0, 0.0
+        trees.moves[row, node], trees.depth[row, node], trees.parent[row, node] = 0, 0, -1
+        if box[i] == target[i]:
+            trees.solution[row] = node
+        elif target[i] != NONE and box[i] & wall[i] == NONE and count(box[i]) == count(target[i]):
+            trees.dead[row] = dead_squares(push_distances(~wall[i], target[i]))
+            trees.heap[row, 0], trees.waiting[row] = node, 1
+
+
+@njit(cache=True, nogil=True)
+def pop(trees: Trees, rows: NDArray[np.int64], nodes: NDArray[np.int64]) -> None:
+    """Take the cheapest node out of each of R trees and write it to `nodes`, [R]."""
+    for i in range(len(rows)):
+        row = np.int64(rows[i])
+        nodes[i] = _take_first(trees.heap[row], trees.cost[row], trees.waiting[row])
+        trees.waiting[row] -= 1
+        trees.expansions[row] += 1
+
+
+@njit(cache=True, nogil=True)
+def hopeless(box: Bits, wall: Bits, target: Bits, dead: Bits) -> bool:
+    """Return whether a box stands where no target can be reached, or is frozen off the targets: a proof of no solution.
+
+    Args:
+        box: Boxes.
+        wall: Walls.
+        target: Targets.
+        dead: Squares from which no target can be reached.
+    """
+    return box & dead != NONE or frozen(box, wall, dead) & ~target != NONE
+
+
+@njit(cache=True, nogil=True)
+def expand(
+    trees: Trees,
+    rows: NDArray[np.int64],
+    nodes: NDArray[np.int64],
+    push: NDArray[np.float32],
+    alive: NDArray[np.float32],
+    limit: Int,
+) -> None:
+    """Put what R nodes lead to into their trees; see `forest.Forest.expand`."""
+    distance = np.empty(SQUARES, np.int8)
+    direction_of, square_of = np.empty((2, 4 * SQUARES), np.int64)
+    for i in range(len(rows)):
+        row, node = np.int64(rows[i]), np.int64(nodes[i])
+        wall, target, dead, box = trees.wall[row], trees.target[row], trees.dead[row], trees.box[row, node]
+        trees.expanded[row, node] = True
+        free = ~wall & ~box
+        start = np.int64(trees.agent[row, node])
+        reached = flood(bit(start), free)
+        options, largest = 0, -np.inf
+        for direction in range(4):
+            ready = pushable(reached, free, box, direction)
+            while ready != NONE:
+                square = lowest(ready)
+                ready &= ready - ONE
+                if not hopeless(pushed(box, square, direction), wall, target, dead):
+                    direction_of[options], square_of[options] = direction, square
+                    options += 1
+                    largest = max(largest, push[i, direction, square])
+        # The network's probabilities over what is worth a node.
+        total = 0.0
+        for k in range(options):
+            total += np.exp(push[i, direction_of[k], square_of[k]] - largest)
+        if options:
+            walk_distances(start, free, distance)
+        for k in range(options):
+            direction, square = direction_of[k], square_of[k]
+            moves = trees.moves[row, node] + distance[square - SQUARE_STEP[direction]] + 1
+            after = pushed(box, square, direction)
+            if moves > limit or trees.nodes[row] == trees.box.shape[1]:
+                continue
+            region = lowest(flood(bit(square), ~wall & ~after))
+            slot = _find(trees, row, after, region)
+            seen = trees.table[row, slot]
+            if seen >= 0 and trees.moves[row, seen] <= moves:
+                continue
+            child = _add(trees, row, slot, after, square, region)
+            logp = trees.logp[row, node] + push[i, direction, square] - largest - np.log(total)
+            depth = trees.depth[row, node] + 1
+            trees.logp[row, child], trees.moves[row, child], trees.depth[row, child] = logp, moves, depth
+            trees.parent[row, child], trees.push[row, child] = node, 4 * square + direction
+            if after == target:
+                trees.solution[row] = child
+                break
+            trees.cost[row, child] = np.log(depth + 1.0) - logp - DEAD_WEIGHT * alive[i]
+            _sift_up(trees.heap[row], trees.cost[row], trees.waiting[row], child)
+            trees.waiting[row] += 1
+
+
+@njit(cache=True, nogil=True)
+def judge(
+    trees: Trees,
+    row: Int,
+    node: NDArray[np.int64],
+    solvable: NDArray[np.bool_],
+    lost: NDArray[np.bool_],
+    known: NDArray[np.uint64],
+    dead: NDArray[np.uint64],
+    searched: NDArray[np.bool_],
+) -> None:
+    """Fill `Verdicts` of the nodes that were expanded; all pushes of these, and where they lead, are found again."""
+    wall, target = trees.wall[row], trees.target[row]
+    source, direction_of, square_of, child_of = np.empty((4, 4 * SQUARES * len(node)), np.int64)
+    edges = 0
+    # Of states, by the node that stands for them in the table.
+    is_live, solves = np.ones(trees.nodes[row], np.bool_), np.zeros(trees.nodes[row], np.bool_)
+    state_of = np.empty(len(node), np.int64)
+    for x in range(len(node)):
+        at = np.int64(node[x])
+        box = trees.box[row, at]
+        state_of[x] = trees.table[row, _find(trees, row, box, trees.region[row, at])]
+        is_live[state_of[x]] = False
+        free = ~wall & ~box
+        reached = flood(bit(trees.agent[row, at]), free)
+        for direction in range(4):
+            ready = pushable(reached, free, box, direction)
+            while ready != NONE:
+                square = lowest(ready)
+                ready &= ready - ONE
+                after = pushed(box, square, direction)
+                child = _DEAD
+                if not hopeless(after, wall, target, trees.dead[row]):
+                    region = lowest(flood(bit(square), ~wall & ~after))
+                    child = np.int64(trees.table[row, _find(trees, row, after, region)])
+                source[edges], direction_of[edges] = x, direction
+                square_of[edges], child_of[edges] = square, child
+                edges += 1
+    if trees.solution[row] >= 0:
+        solves[trees.solution[row]] = True
+    changed = True
+    while changed:
+        changed = False
+        for e in range(edges - 1, -1, -1):
+            state, child = state_of[source[e]], child_of[e]
+            if child == _DEAD:
+                continue
+            if not is_live[state] and (child < 0 or is_live[child]):
+                is_live[state] = changed = True
+            if child >= 0 and solves[child] and not solves[state]:
+                solves[state] = changed = True
+    for e in range(edges):
+        x, child = source[e], child_of[e]
+        deadly = child == _DEAD or (child >= 0 and not is_live[child])
+        if deadly or (child >= 0 and solves[child]):
+            known[x, direction_of[e]] |= bit(square_of[e])
+        if deadly:
+            dead[x, direction_of[e]] |= bit(square_of[e])
+            searched[x] |= child >= 0
+    for x in range(len(node)):
+        solvable[x], lost[x] = solves[state_of[x]], not is_live[state_of[x]]
