@@ -1,4 +1,4 @@
-"""Train the planner: `python -m mujoban_planner.train imitation` or `... mpo`."""
+"""Train the planner: `python -m mujoban_planner.train imitation`, `... expert-iteration` or `... mpo`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import torch
 import tyro
 
 from mujoban_planner import load
+from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.imitation import ImitationConfig, ImitationTrainer
 from mujoban_planner.reinforcement import MPOConfig, MPOTrainer
+from mujoban_rl.engine import Cadence
 
 
 @dataclass(frozen=True)
@@ -87,9 +89,33 @@ class MPO:
         )
 
 
+@dataclass(frozen=True)
+class ExpertIteration:
+    """Learn from what the planner's own search finds, without a solver."""
+
+    run: Path = Path("runs/planner_search")
+    """Run directory; an existing one is resumed."""
+    seconds: float | None = None
+    """Stop after so many seconds; a later call resumes."""
+    evaluate_every: float = 300.0
+    """Seconds between evaluations on held-out levels."""
+    save_every: float = 300.0
+    """Seconds between checkpoints."""
+    threads: int = 1
+    """Threads of the network."""
+    config: tyro.conf.OmitArgPrefixes[ExpertIterationConfig] = field(default_factory=ExpertIterationConfig)
+
+    def main(self) -> None:
+        """Train."""
+        torch.set_num_threads(self.threads)
+        cadence = Cadence(evaluate_seconds=self.evaluate_every, save_seconds=self.save_every)
+        expert_iteration(self.config, self.run, cadence).run(limit_seconds=self.seconds)
+
+
 def main() -> None:
     """Run the command line."""
-    command = tyro.extras.subcommand_cli_from_dict({"imitation": Imitation, "mpo": MPO})
+    commands = {"imitation": Imitation, "expert-iteration": ExpertIteration, "mpo": MPO}
+    command = tyro.extras.subcommand_cli_from_dict(commands)
     try:
         command.main()
     except ValueError as error:

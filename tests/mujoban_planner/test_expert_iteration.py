@@ -1,0 +1,113 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mujoban_planner.boards import BitBoards, bit_boards, level_batch
+from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
+from mujoban_planner.forest import Forest
+from mujoban_planner.networks import ResidualPlanner
+from mujoban_planner.samples import Samples
+from mujoban_planner.search import grow
+from mujoban_planner.search_lessons import SearchConfig, SearchLessons
+from mujoban_planner.training_levels import TrainingLevels
+from mujoban_rl.engine import Cadence
+from mujoban_rl.testing import check_refusal, check_resuming
+from mujoban_sokoban.bitboard import SQUARE_STEP
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
+from mujoban_sokoban.levels import Level, stack_levels
+from mujoban_sokoban.solver import Status, solve_batch
+
+SMALL = SearchConfig(trees=16, expansions=20, buffer=4000)
+
+
+@pytest.fixture(scope="module")
+def lessons():
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    lessons = SearchLessons(ResidualPlanner(8, 1, judge=True), SMALL, batch_size=64, seed=0)
+    for _ in range(4):
+        lessons.next_batch()
+    return lessons
+
+
+def judged_pushes(samples: Samples):
+    """Return each state, direction and square of a push that was judged, and whether it is deadly."""
+    bits = [np.unpackbits(np.ascontiguousarray(x).view(np.uint8), axis=1, bitorder="little") for x in samples[-2:]]
+    state, push = np.nonzero(bits[0])
+    return state, push // 64, push % 64, bits[1][state, push].astype(bool)
+
+
+def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
+    ways, off_way = (part.storage.take(np.arange(min(part.size, 400))) for part in (lessons._ways, lessons._verdicts))
+    for samples, both in ((ways, True), (off_way, False)):
+        state, direction, square, deadly = judged_pushes(samples)
+        one = np.uint64(1)
+        box = samples.box[state] ^ (one << square.astype(np.uint64))
+        box |= one << (square + SQUARE_STEP[direction]).astype(np.uint64)
+        boards = BitBoards(samples.wall[state], samples.target[state], box, square.astype(np.uint8))
+        status = solve_batch(level_batch(boards)).status
+        assert (status == np.where(deadly, Status.UNSOLVABLE, Status.SOLVED)).all()
+        assert deadly.sum() > 30 and (not both or (~deadly).sum() > 30)
+
+
+def test_ways_lead_to_the_solution_in_the_moves_that_their_values_count(lessons):
+    ways = lessons._ways.storage.take(np.arange(lessons._ways.size))
+    solved = solve_batch(level_batch(ways.boards))
+    assert (solved.status == Status.SOLVED).all()
+    last = np.isclose(ways.value, 10.99)  # the last box goes home in the next instruction
+    assert last.any() and (solved.length[last] == 1).all()
+
+
+def test_a_search_that_has_looked_everywhere_proves_a_level_lost():
+    dead = Level.from_text("########\n#      #\n# $$ . #\n# .@   #\n########")
+    torch.manual_seed(0)
+    forest = Forest(1, 400, 120)
+    forest.plant(np.arange(1), bit_boards(stack_levels([dead])))
+    planner = ResidualPlanner(8, 1).eval()
+    assert forest.open.all()
+    steps = 0
+    while forest.open.any():
+        grow(forest, np.arange(1), planner)
+        steps += 1
+    verdicts = forest.judge(0)
+    expected = solve_batch(stack_levels([dead])).status[0] == Status.UNSOLVABLE
+    assert bool(verdicts.lost[0]) == expected and bool(verdicts.solvable[0]) == (not expected)
+    assert steps == forest.expansions[0]
+
+
+def test_levels_that_were_not_solved_come_again_and_the_mix_follows_what_is_solved():
+    levels = TrainingLevels(0, retried=1.0, retries=1)
+    _, tickets = levels.draw(64)
+    assert all(ticket.seed in TRAIN_SEEDS for ticket in tickets)
+    levels.report(tickets[0], solved=False)
+    boards, again = levels.draw(1)
+    assert again == [tickets[0]._replace(failures=1)]
+    expected = bit_boards(generate_batch(tickets[0].difficulty, [tickets[0].seed]))
+    assert all((x == y).all() for x, y in zip(boards, expected, strict=True))
+    levels.report(again[0], solved=False)
+    assert levels.draw(1)[1][0].failures == 0
+    for _ in range(300):
+        for ticket in levels.draw(4)[1]:
+            levels.report(ticket, solved=True)
+    assert levels.shares[-1] > 0.8
+    with pytest.raises(ValueError, match="stream -1"):
+        TrainingLevels(-1)
+
+
+def run(path, **options):
+    config = ExpertIterationConfig(
+        channels=8, blocks=1, search=SMALL, batch_size=32, cpu_seconds=1e9, updates=8, noise=0.1, hidden=0.2, **options
+    )
+    trainer = expert_iteration(config, path, Cadence(publish_updates=2, save_seconds=math.inf))
+    trainer.learner.evaluate = dict
+    return trainer
+
+
+def test_a_run_resumes_to_the_bit(tmp_path):
+    check_resuming(run, tmp_path, stop_at=4, updates=8)
+
+
+def test_a_batch_with_nan_teaches_nothing(tmp_path):
+    check_refusal(run(tmp_path), lambda batch: batch._replace(state=batch.state * math.nan))
