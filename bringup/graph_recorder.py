@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
+from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
@@ -49,7 +50,9 @@ class RecorderNode(Node):
         path: Any = self.declare_parameter("path", "bag", fixed).value
         episodes_per_file = self.declare_parameter("episodes_per_file", 32, fixed).value
         self.counts: Counter[str] = Counter()
-        self._bag = BagWriter(Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file)
+        self._bag = BagWriter(
+            Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file, flush_after=FLUSH_AFTER
+        )
         self._ticks: dict[int, dict[str, bytes]] = {}
         self._last_ticks: set[int] = set()
         self.written = 0

@@ -19,6 +19,7 @@ from bringup.rollout import Tick
 from mujoban_core.bodies import Body
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
+from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.topics import TICK, Topic
 from mujoban_sim.tick_messages import EpisodeProgress, SimulatorTick, TickComposer, TickLabel
 from mujoban_sokoban.episodes import EpisodeSpec
@@ -87,7 +88,9 @@ class Recorder:
         for m, number in enumerate(tick.rows.tolist()):
             if number not in self._rows:
                 path = self._path / f"{self._prefix}row{number:03d}"
-                writer = BagWriter(path, TOPICS, episodes_per_file=self._episodes_per_file)
+                writer = BagWriter(
+                    path, TOPICS, episodes_per_file=self._episodes_per_file, flush_after=FLUSH_AFTER
+                )
                 self._rows[number] = _Row(writer, TickComposer(self._body))
             self._write_row(self._rows[number], tick, m)
         self.ticks += len(tick.rows)

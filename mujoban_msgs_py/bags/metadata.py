@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,12 @@ VERSION: Final = 9
 DISTRIBUTION: Final = "jazzy"
 
 _KEY: Final = "rosbag2_bagfile_information"
+_BAG: Final = "mujoban_bag"
+"""Key of `Metadata.bag` in the custom data."""
+_DIGEST: Final = "sha256/"
+"""Beginning of the keys of the files' checksums in the custom data."""
+_OWN_DIGEST: Final = "mujoban_sha256"
+"""Key of the checksum of all else in the file."""
 _FOREVER: Final = {"sec": 9223372036, "nsec": 854775807}
 
 
@@ -55,6 +62,10 @@ class FileRecord:
     start: int = 0
     end: int = 0
     count: int = 0
+    digest: str = ""
+    """SHA-256 of the file in hexadecimal; empty where it is not known."""
+    stated: bool = True
+    """Whether start, end and count are known."""
 
     def add(self, stamp: int) -> None:
         """Count a message."""
@@ -71,12 +82,15 @@ class Metadata:
     topics: dict[str, TopicRecord] = field(default_factory=dict)
     files: list[FileRecord] = field(default_factory=list)
     compression_mode: str = ""
+    bag: str = ""
+    """What tells this bag from all others; empty for those of other writers."""
 
     def write(self, folder: Path) -> None:
         """Replace the file in `folder` atomically."""
-        content = {_KEY: self._information()}
-        text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
-        write_atomically(folder / FILE_NAME, text.encode())
+        information = self._information()
+        if self.bag:
+            information["custom_data"][_OWN_DIGEST] = _digest(information)
+        write_atomically(folder / FILE_NAME, _dump({_KEY: information}).encode())
 
     @classmethod
     def read(cls, folder: Path) -> Metadata | None:
@@ -91,17 +105,22 @@ class Metadata:
         try:
             information = yaml.safe_load(path.read_text())[_KEY]
             topics = [_topic(entry) for entry in information["topics_with_message_count"]]
+            custom = information.get("custom_data") or {}
+            stated = custom.pop(_OWN_DIGEST, None)
+            if stated is not None and stated != _digest(information):
+                raise ValueError("its checksum is not that of its content")
             return cls(
-                storage=information["storage_identifier"],
+                storage=_text(information["storage_identifier"]),
                 topics={topic.name: topic for topic in topics},
-                files=[FileRecord(Path(name).name) for name in information["relative_file_paths"]],
-                compression_mode=(information.get("compression_mode") or "").lower(),
+                files=_files(information, custom),
+                compression_mode=_text(information.get("compression_mode") or "").lower(),
+                bag=_text(custom.get(_BAG, "")),
             )
-        except (yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
+        except (yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
             reason = " ".join(str(error).split())
             raise BagError(f"{path} is not the metadata of a rosbag2 bag: {type(error).__name__} {reason}") from None
 
-    def _information(self) -> Mapping[str, Any]:
+    def _information(self) -> dict[str, Any]:
         filled = [file for file in self.files if file.count]
         start = min((file.start for file in filled), default=0)
         end = max((file.end for file in filled), default=0)
@@ -116,9 +135,14 @@ class Metadata:
             "compression_mode": "",
             "relative_file_paths": [file.path for file in self.files],
             "files": [_file_entry(file) for file in self.files],
-            "custom_data": None,
+            "custom_data": self._custom() or None,
             "ros_distro": DISTRIBUTION,
         }
+
+
+    def _custom(self) -> dict[str, str]:
+        digests = {_DIGEST + file.path: file.digest for file in self.files if file.digest}
+        return digests | ({_BAG: self.bag} if self.bag else {})
 
 
 class _Dumper(yaml.SafeDumper):
@@ -126,6 +150,14 @@ class _Dumper(yaml.SafeDumper):
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
+
+
+def _dump(content: Any) -> str:
+    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
+
+
+def _digest(information: Mapping[str, Any]) -> str:
+    return hashlib.sha256(_dump(information).encode()).hexdigest()
 
 
 def dump_qos(profiles: Sequence[Mapping[str, Any]]) -> str:
@@ -139,14 +171,41 @@ def load_qos(text: str | Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [dict(p) for p in profiles or []]
 
 
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value
+
+
+def _count(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise TypeError(f"{value!r} is no count")
+    return value
+
+
+def _files(information: Mapping[str, Any], custom: Mapping[str, Any]) -> list[FileRecord]:
+    """Return what is said of each file that is listed."""
+    stated = {_text(entry["path"]): entry for entry in information.get("files") or []}
+    files = []
+    for name in map(_text, information["relative_file_paths"]):
+        file = FileRecord(Path(name).name, digest=_text(custom.get(_DIGEST + name, "")), stated=name in stated)
+        if file.stated:
+            entry = stated[name]
+            file.start = _count(entry["starting_time"]["nanoseconds_since_epoch"])
+            file.end = file.start + _count(entry["duration"]["nanoseconds"])
+            file.count = _count(entry["message_count"])
+        files.append(file)
+    return files
+
+
 def _topic(entry: Mapping[str, Any]) -> TopicRecord:
     told = entry["topic_metadata"]
     return TopicRecord(
-        name=told["name"],
-        type_name=told["type"],
-        type_hash=told.get("type_description_hash", ""),
+        name=_text(told["name"]),
+        type_name=_text(told["type"]),
+        type_hash=_text(told.get("type_description_hash", "")),
         qos=load_qos(told.get("offered_qos_profiles", [])),
-        count=entry["message_count"],
+        count=_count(entry["message_count"]),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
@@ -11,7 +12,8 @@ from typing import Any, Final, NamedTuple
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags.errors import BagError
-from mujoban_msgs_py.bags.metadata import FILE_NAME, Metadata
+from mujoban_msgs_py.bags.integrity import check_family, file_digest, read_identity, require_regular
+from mujoban_msgs_py.bags.metadata import FILE_NAME, FileRecord, Metadata
 from mujoban_msgs_py.bags.storage import Damage, McapFile, RawMessage, SqliteBag, Storage, TopicInfo
 from mujoban_msgs_py.bags.types import TypeRegistry
 from mujoban_msgs_py.decoders import DECODERS
@@ -53,9 +55,10 @@ class Bag:
         incomplete: After `ticks`: messages that found no partner, by topic.
     """
 
-    def __init__(self, path: Path, storages: Sequence[Storage]) -> None:
+    def __init__(self, path: Path, storages: Sequence[Storage], doubts: Sequence[str] = ()) -> None:
         """Use `open_bag`."""
         self.path = path
+        self._doubts = tuple(doubts)
         self.incomplete: Counter[str] = Counter()
         self._storages = tuple(storages)
 
@@ -85,7 +88,7 @@ class Bag:
     @property
     def skipped(self) -> list[str]:
         """What was left out so far because it was damaged, in words."""
-        return [text for storage in self._storages for text in storage.skipped]
+        return [*self._doubts, *(text for storage in self._storages for text in storage.skipped)]
 
     def messages(self, names: Iterable[str] | None = None) -> Iterator[BagMessage]:
         """Yield serialised messages in the order in which they were recorded.
@@ -176,6 +179,10 @@ class Bag:
             raise BagError(f"no topic {', '.join(missing)} in bag {self.path}; its topics: {has}")
 
 
+def _is_over(episode: conversions.EpisodeReading) -> bool:
+    return episode.terminated or episode.truncated
+
+
 def open_bag(path: str | Path, *, damaged: Damage = "refuse") -> Bag:
     """Open a bag: a folder, with or without metadata.yaml, or one .mcap or .db3 file.
 
@@ -190,32 +197,107 @@ def open_bag(path: str | Path, *, damaged: Damage = "refuse") -> Bag:
     path = Path(path)
     if not path.exists():
         raise BagError(f"no bag at {path}")
-    if path.is_file():
+    if not path.is_dir():
         return Bag(path, [_storage(path, damaged)])
     metadata = Metadata.read(path)
+    files = sorted((*path.glob("*.mcap"), *path.glob("*.db3")), key=_number)
+    doubts = _Doubts(path, damaged)
     if metadata is None:
-        files = sorted((*path.glob("*.mcap"), *path.glob("*.db3")), key=_number)
         if not files:
             raise BagError(f"{path} is not a bag: it has neither {FILE_NAME} nor .mcap or .db3 files")
-        return Bag(path, [_storage(file, damaged) for file in files])
-    if metadata.storage == "sqlite3":
-        return Bag(path, [SqliteBag(path)])
-    if metadata.storage != "mcap" or metadata.compression_mode in ("file", "message"):
+        return Bag(path, _without_metadata(files, doubts), doubts.noted)
+    if metadata.storage not in ("mcap", "sqlite3") or metadata.compression_mode in ("file", "message"):
         kind = f"{metadata.storage} storage {metadata.compression_mode}".strip()
         raise BagError(f"{path} has {kind}: expected sqlite3, or mcap without compression of files or messages")
-    return Bag(path, [_storage(path / file.path, damaged) for file in metadata.files])
+    listed = _listed(path, metadata, files, doubts)
+    if metadata.storage == "sqlite3":
+        if not all(file.digest for file in listed):
+            text = f"{path} carries no checksums, so that damage to its messages goes unseen"
+            warnings.warn(f"{text}; `ros2 bag reindex` adds them", stacklevel=2)
+        storages: list[Storage] = [SqliteBag(path, [path / file.path for file in listed])]
+        _compare_counts(sum(file.count for file in listed), listed, storages[0], doubts)
+        return Bag(path, storages, doubts.noted)
+    storages = []
+    for file in listed:
+        storage = _storage(path / file.path, damaged)
+        storages.append(storage)
+        if isinstance(storage, McapFile) and storage.complete:
+            _compare_counts(file.count, [file], storage, doubts)
+    return Bag(path, storages, doubts.noted)
+
+
+class _Doubts:
+    """What is wrong with the files of a bag: an error, or a note where damage is to be skipped."""
+
+    def __init__(self, path: Path, damaged: Damage) -> None:
+        self._path, self._skip = path, damaged == "skip"
+        self.noted: list[str] = []
+
+    @property
+    def skips(self) -> bool:
+        """Whether doubts are noted alone."""
+        return self._skip
+
+    def __call__(self, what: str) -> None:
+        if not self._skip:
+            raise BagError(f"{self._path} is damaged: {what}; to read what is whole, open it with damage skipped")
+        self.noted.append(what)
+
+
+def _without_metadata(files: Sequence[Path], doubts: _Doubts) -> list[Storage]:
+    """Return the files of a bag that has lost its metadata.yaml."""
+    for file in files:
+        require_regular(file)
+    identities = {file: read_identity(file) for file in files}
+    storages = {file: _storage(file, "skip" if doubts.skips else "refuse") for file in files}
+    ours = [storage for file, storage in storages.items() if identities[file] is not None]
+    last = any(isinstance(storage, McapFile) and storage.is_last for storage in ours)
+    return [storages[file] for file in check_family(identities, doubts, last=last)]
+
+
+def _listed(path: Path, metadata: Metadata, files: Sequence[Path], doubts: _Doubts) -> list[FileRecord]:
+    """Return the files that metadata.yaml lists and that are those that it means."""
+    if not metadata.files:
+        doubts(f"{FILE_NAME} lists no file")
+    names = [file.path for file in metadata.files]
+    for name in sorted({file.name for file in files} - set(names)):
+        doubts(f"{name} is not listed in its {FILE_NAME}")
+    kept: dict[str, FileRecord] = {}
+    for file in metadata.files:
+        at = path / file.path
+        if file.path in kept:
+            doubts(f"{FILE_NAME} lists {file.path} twice")
+            continue
+        require_regular(at)
+        identity = read_identity(at) if at.suffix == ".mcap" else None
+        if metadata.bag and identity is not None and identity.bag != metadata.bag:
+            doubts(f"{file.path} is of another bag")
+            continue
+        if file.digest and file_digest(at) != file.digest:
+            doubts(f"{file.path} is damaged or another file: its SHA-256 is not the one in {FILE_NAME}")
+        kept[file.path] = file
+    return list(kept.values())
+
+
+def _compare_counts(expected: int, files: Sequence[FileRecord], storage: Storage, doubts: _Doubts) -> None:
+    """Compare the messages and their times with what metadata.yaml says, where it says so."""
+    if not all(file.stated for file in files):
+        return
+    count = storage.count
+    names = ", ".join(file.path for file in files)
+    if count != expected:
+        doubts(f"{names} has {count} messages, not {expected} as {FILE_NAME} says")
+    elif count and storage.span != (span := (min(f.start for f in files), max(f.end for f in files))):
+        doubts(f"{names} reaches from {storage.span} ns, not {span} as {FILE_NAME} says")
 
 
 def _storage(path: Path, damaged: Damage) -> Storage:
+    require_regular(path)
     if path.suffix == ".mcap":
         return McapFile(path, damaged)
     if path.suffix == ".db3":
-        return SqliteBag(path)
+        return SqliteBag(path, [path])
     raise BagError(f"{path} is not a bag: expected a folder, .mcap or .db3")
-
-
-def _is_over(episode: conversions.EpisodeReading) -> bool:
-    return episode.terminated or episode.truncated
 
 
 def _number(path: Path) -> tuple[int, str]:

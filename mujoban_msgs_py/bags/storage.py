@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,17 +17,19 @@ import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.stream_reader import CRCValidationError, StreamReader
 from rosbags.rosbag2 import Reader as RosbagsReader
 from rosbags.rosbag2 import ReaderError
 
+from mujoban_msgs_py.bags.chunks import open_chunk
 from mujoban_msgs_py.bags.errors import BagError
+from mujoban_msgs_py.bags.integrity import LAST, require_regular
 from mujoban_msgs_py.bags.metadata import load_qos
 
 Damage = Literal["refuse", "skip"]
 """What to do about damage: raise `BagError`, or leave out the damaged chunk and go on."""
 
-RECORD_LIMIT: Final = 1 << 30
+RECORD_LIMIT: Final = 1 << 28
 """Bytes of a record above which its length is taken for damage."""
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
@@ -78,6 +80,11 @@ class Storage(ABC):
         """The topics by name."""
 
     @property
+    def count(self) -> int:
+        """Messages."""
+        return sum(topic.count for topic in self.topics.values())
+
+    @property
     @abstractmethod
     def schemas(self) -> dict[str, str]:
         """Type name -> concatenated definition, of the types whose definition the file holds."""
@@ -115,6 +122,7 @@ class McapFile(Storage):
         """
         super().__init__(path)
         self._skip = damaged == "skip"
+        require_regular(path)
         try:
             with path.open("rb") as stream:
                 head = stream.read(len(_MAGIC))
@@ -141,6 +149,18 @@ class McapFile(Storage):
     def span(self) -> tuple[int, int] | None:
         """First and last log time."""
         return self._contents.span
+
+    @cached_property
+    def is_last(self) -> bool:
+        """Whether the file says that it is the last of its bag."""
+        if not self.complete:
+            return False
+        try:
+            with self.path.open("rb") as stream:
+                summary = SeekingReader(stream).get_summary()
+        except _DAMAGE:
+            return False
+        return summary is not None and any(index.name == LAST for index in summary.metadata_indexes)
 
     @cached_property
     def _contents(self) -> _Contents:
@@ -216,7 +236,7 @@ class McapFile(Storage):
 
     def _open_chunk(self, chunk: Chunk, number: int, note: bool) -> Iterator[Channel | Schema | Message]:
         try:
-            records = breakup_chunk(chunk, validate_crc=True)
+            records = open_chunk(chunk)
         except _DAMAGE as error:
             self._damage(f"has a damaged chunk, number {number}: {_reason(error)}", note=note)
             return
@@ -233,6 +253,23 @@ class McapFile(Storage):
 
 class SqliteBag(Storage):
     """sqlite3 storage: a folder with its metadata.yaml, or one .db3 file."""
+
+    def __init__(self, path: Path, files: Sequence[Path]) -> None:
+        """Look over its database files.
+
+        Raises:
+            BagError: If one of them is missing, or is no whole database.
+        """
+        super().__init__(path)
+        self._count = 0
+        for file in files:
+            require_regular(file)
+            self._count += _count_messages(file)
+
+    @property
+    def count(self) -> int:
+        """Messages in the files, which metadata.yaml may see differently."""
+        return self._count
 
     @cached_property
     def topics(self) -> dict[str, TopicInfo]:
@@ -280,6 +317,19 @@ class SqliteBag(Storage):
             yield reader
         finally:
             reader.close()
+
+
+def _count_messages(path: Path) -> int:
+    """Return the messages of a database whose structure is whole; what they say has no checksum in it."""
+    try:
+        with closing(apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READONLY)) as database:
+            said = [row[0] for row in database.execute("PRAGMA integrity_check(1)")]
+            count = next(database.execute("SELECT count(*) FROM messages"))[0]
+    except (apsw.Error, UnicodeDecodeError) as error:
+        raise BagError(f"{path} is damaged: {_reason(error)}") from None
+    if said != ["ok"]:
+        raise BagError(f"{path} is damaged: {' '.join(str(said[0]).split())}")
+    return int(count)
 
 
 def _gather(

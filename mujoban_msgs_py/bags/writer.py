@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Final, Self
+from typing import Any, Final, Self
 
 from mcap.writer import CompressionType, Writer
 
 from mujoban_msgs_py.bags.errors import BagError
+from mujoban_msgs_py.bags.integrity import IDENTITY, LAST, HashedFile, Identity, dump_identity
 from mujoban_msgs_py.bags.metadata import FileRecord, Metadata, TopicRecord, dump_qos, qos_profile
 from mujoban_msgs_py.bags.types import TypeRegistry
 from mujoban_msgs_py.topics import Topic
 
 CHUNK_SIZE: Final = 1 << 20
-"""Bytes of a chunk before compression: what a killed recorder can lose."""
+"""Bytes of a chunk before compression."""
+FLUSH_AFTER: Final = 8
+"""`BagWriter.flush_after` of what records the graph: ticks that a recorder loses at most when it is killed."""
 PROFILE: Final = "ros2"
 
 _COMPRESSION: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
@@ -36,6 +40,7 @@ class BagWriter:
         episodes_per_file: int | None = None,
         chunk_size: int = CHUNK_SIZE,
         compression: str = "zstd",
+        flush_after: int | None = None,
     ) -> None:
         """Make the bag's folder and open its first file.
 
@@ -45,13 +50,16 @@ class BagWriter:
             episodes_per_file: Calls of `end_episode` after which a new file is begun; None means one file.
             chunk_size: Bytes of a chunk before compression.
             compression: Of chunks: "zstd", "lz4" or "" for none.
+            flush_after: Different stamps after which a chunk is finished, which is all that a writer that is killed
+                can lose; None leaves it to the chunk's size.
 
         Raises:
             BagError: If there is something at `path` already, or an option is out of its range.
         """
         if compression not in _COMPRESSION:
             raise BagError(f"compression must be 'zstd', 'lz4' or '', got {compression!r}")
-        for name, value in (("episodes_per_file", episodes_per_file), ("chunk_size", chunk_size)):
+        counts = {"episodes_per_file": episodes_per_file, "chunk_size": chunk_size, "flush_after": flush_after}
+        for name, value in counts.items():
             if value is not None and value < 1:
                 raise BagError(f"{name} must be at least 1, got {value}")
         self.path = Path(path)
@@ -59,11 +67,14 @@ class BagWriter:
         self._chunk_size = chunk_size
         self._compression = _COMPRESSION[compression]
         self._types = TypeRegistry()
-        self._metadata = Metadata()
+        self._metadata = Metadata(bag=secrets.token_hex(16))
+        self._flush_after = flush_after
+        self._stamps: set[int] = set()
         self._episodes = 0
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
-        self._stream: BinaryIO | None = None
+        self._stream: HashedFile | None = None
+        self._is_split = False
         try:
             self.path.mkdir(parents=True)
         except FileExistsError:
@@ -110,10 +121,18 @@ class BagWriter:
         if channel is None or self._stream is None:
             reason = "is closed" if self._stream is None else f"has no topic {topic!r}"
             raise BagError(f"cannot write to {self.path}: it {reason}")
+        if self._is_split:
+            self._close_file()
+            self._open_file()
+            channel = self._channels[topic]
         record = self._metadata.topics[topic]
         self._writer.add_message(channel, stamp, data, stamp if published is None else published, record.count)
         record.count += 1
         self._metadata.files[-1].add(stamp)
+        if self._flush_after is not None:
+            self._stamps.add(stamp)
+            if len(self._stamps) > self._flush_after:
+                self.flush()
 
     def end_episode(self) -> None:
         """Note that an episode is complete; after `episodes_per_file` of them a new file is begun."""
@@ -122,23 +141,21 @@ class BagWriter:
             self.split()
 
     def split(self) -> None:
-        """Finish the file and begin the next one, unless the file is still empty."""
-        if self._metadata.files[-1].count:
-            self._close_file()
-            self._open_file()
+        """Begin the next file with the next message, unless the file is still empty."""
+        self._is_split = self._metadata.files[-1].count > 0
 
     def flush(self) -> None:
         """Finish the chunk in progress, so that a reader can see everything written so far."""
         if self._stream is not None:
             self._writer.flush()
+            self._stamps.clear()
 
     def close(self) -> None:
         """Finish the last file and metadata.yaml; a second call does nothing."""
         if self._stream is None:
             return
+        self._writer.add_metadata(LAST, {})
         self._close_file()
-        if len(self._metadata.files) > 1 and not self._metadata.files[-1].count:
-            (self.path / self._metadata.files.pop().path).unlink()
         self._metadata.write(self.path)
 
     def __enter__(self) -> Self:
@@ -151,16 +168,17 @@ class BagWriter:
 
     def _open_file(self) -> None:
         file = FileRecord(f"{self.path.name}_{len(self._metadata.files)}.mcap")
-        # A buffer smaller than any record: what is written has left the process, should it be killed.
-        self._stream = (self.path / file.path).open("xb", buffering=2)
+        self._stream, self._is_split = HashedFile(self.path / file.path), False
         self._writer = Writer(
-            self._stream,
+            self._stream,  # pyright: ignore[reportArgumentType]  # what it calls
             chunk_size=self._chunk_size,
             compression=self._compression,
             enable_crcs=True,
             enable_data_crcs=True,
         )
         self._writer.start(profile=PROFILE)
+        identity = Identity(self._metadata.bag, len(self._metadata.files))
+        self._writer.add_metadata(IDENTITY, dump_identity(identity))
         self._channels, self._schemas = {}, {}
         self._metadata.files.append(file)
         for topic in self._metadata.topics.values():
@@ -170,6 +188,7 @@ class BagWriter:
     def _close_file(self) -> None:
         assert self._stream is not None
         self._writer.finish()
+        self._metadata.files[-1].digest = self._stream.digest
         self._stream.close()
         self._stream = None
 

@@ -217,7 +217,7 @@ def test_a_missing_topic_is_named_with_those_that_are_there(tmp_path):
         (lambda p: p.write_text("hello"), "expected a folder, .mcap or .db3"),
         (lambda p: (p.mkdir(), (p / "metadata.yaml").write_text("a: [")), "is not the metadata"),
         (lambda p: (write_bag(p, 2), (p / "b_0.mcap").unlink()), "cannot read .*b_0.mcap"),
-        (lambda p: (write_bag(p, 2), (p / "b_0.mcap").write_bytes(b"PK" * 99)), "is not an MCAP file"),
+        (lambda p: (write_bag(p, 2), (p / "b_0.mcap").write_bytes(b"PK" * 99)), "b_0.mcap is damaged or another file"),
     ],
 )
 def test_what_is_no_bag_is_refused_by_name(tmp_path, make, expected):

@@ -1,0 +1,136 @@
+"""What tells whether a bag is whole: who its files are, their checksums, and what metadata.yaml says of them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from mcap.exceptions import McapError
+from mcap.records import Chunk, Metadata
+from mcap.stream_reader import StreamReader
+
+from mujoban_msgs_py.bags.errors import BagError
+
+IDENTITY: Final = "mujoban_bag"
+"""Name of the MCAP metadata record that says which file of which bag a file is; the first record of the file."""
+LAST: Final = "mujoban_last_file"
+"""Name of the MCAP metadata record in the last file of a bag that was closed."""
+_BLOCK: Final = 1 << 20
+
+
+class Identity(NamedTuple):
+    """Which file of which bag a file is."""
+
+    bag: str
+    """A number that no other bag has."""
+    index: int
+    """From 0."""
+
+
+class HashedFile:
+    """A new file that knows its SHA-256; what is written has left the process, should it be killed."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the file."""
+        self._file = path.open("xb", buffering=0)
+        self._hash = hashlib.sha256()
+
+    def flush(self) -> None:
+        """Do nothing: nothing is held back."""
+
+    def tell(self) -> int:
+        """Return how many bytes were written."""
+        return self._file.tell()
+
+    def write(self, data: Any) -> int:
+        """Write all of `data`."""
+        view = memoryview(data).cast("B")
+        done = 0
+        while done < len(view):
+            done += self._file.write(view[done:]) or 0
+        self._hash.update(view)
+        return done
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what was written so far, in hexadecimal."""
+        return self._hash.hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal; a file that has not changed since is not read again."""
+    status = path.stat()
+    return _digest(path, status.st_size, status.st_mtime_ns, status.st_ino)
+
+
+@lru_cache(maxsize=1024)
+def _digest(path: Path, size: int, changed: int, inode: int) -> str:
+    del size, changed, inode
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def require_regular(path: Path) -> None:
+    """Refuse what is no file, such as a pipe, which nobody may ever write to.
+
+    Raises:
+        BagError: If it is none, or there is nothing.
+    """
+    if not path.exists():
+        raise BagError(f"cannot read {path}: No such file or directory")
+    if not path.is_file():
+        raise BagError(f"cannot read {path}: it is not a regular file")
+
+
+def read_identity(path: Path) -> Identity | None:
+    """Return which file of which bag an MCAP file is; None where its writer did not say, or it is damaged there."""
+    try:
+        with path.open("rb") as stream:
+            for record in StreamReader(stream, emit_chunks=True, record_size_limit=_BLOCK).records:
+                if isinstance(record, Metadata) and record.name == IDENTITY:
+                    return Identity(record.metadata["bag"], int(record.metadata["index"]))
+                if isinstance(record, Chunk):
+                    return None
+    except (McapError, ValueError, KeyError, EOFError, OSError, RuntimeError):
+        return None
+    return None
+
+
+def check_family(identities: dict[Path, Identity | None], complain: Callable[[str], None], *, last: bool) -> list[Path]:
+    """Return the files that belong together, in order; for a bag without metadata.yaml.
+
+    Args:
+        identities: Of the files that are there, in order.
+        complain: Told what is wrong, in words.
+        last: Whether the last of them says that it is the bag's last.
+    """
+    known = {path: identity for path, identity in identities.items() if identity is not None}
+    if not known:
+        return list(identities)
+    own = next(iter(known.values())).bag
+    kept: dict[int, Path] = {}
+    for path, identity in identities.items():
+        if identity is None or identity.bag != own:
+            complain(f"{path.name} is of another bag than {next(iter(known)).name}")
+        elif identity.index in kept:
+            complain(f"{path.name} is the same file as {kept[identity.index].name}")
+        else:
+            kept[identity.index] = path
+    missing = sorted(set(range(max(kept) + 1)) - kept.keys())
+    if missing:
+        complain(f"it lacks file number {', '.join(map(str, missing))}")
+    if not last:
+        complain("it has no metadata.yaml and its last file does not say that it is the last: files may be missing")
+    return [kept[index] for index in sorted(kept)]
+
+
+def dump_identity(identity: Identity) -> dict[str, str]:
+    """Return the content of the `IDENTITY` record."""
+    return {"bag": identity.bag, "index": str(identity.index)}
