@@ -27,7 +27,7 @@ from torch.nn import functional
 
 from mujoban_core.bodies import INERTIAL_SIZE, get_body
 from mujoban_core.camera import FRAME_SIZE, CameraMount, project
-from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction
+from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
 
 MIN_SCALE = 1e-3
@@ -152,11 +152,6 @@ def rows_of_sky(mount: CameraMount, multiple: int) -> int:
     return max(int(level) // multiple * multiple, 0)
 
 
-def _turn(x: Tensor, y: Tensor, along: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
-    """Return vectors (x, y), [M, n] each, in the frame whose x-axis is (along, left), [M, 1] each."""
-    return x * along + y * left, y * along - x * left
-
-
 class VisuomotorController(nn.Module, Controller):
     """The learned controller of paper C.3; sees o_cam, o_pr, A and beta and nothing else.
 
@@ -165,7 +160,7 @@ class VisuomotorController(nn.Module, Controller):
 
     proprio_mean: Tensor
     proprio_scale: Tensor
-    direction: Tensor
+    axes: Tensor
 
     def __init__(
         self,
@@ -210,9 +205,7 @@ class VisuomotorController(nn.Module, Controller):
         self.mean, self.scale = gaussian_layers(features, self.action_size)
         self.register_buffer("proprio_mean", torch.zeros(self.proprio_size))
         self.register_buffer("proprio_scale", torch.ones(self.proprio_size))
-        # Shape [5, 2]: the instructed direction in the map; stay counts as east.
-        direction = np.where(OFFSETS_XY.any(1, keepdims=True), OFFSETS_XY, (1.0, 0.0))
-        self.register_buffer("direction", torch.tensor(direction, dtype=torch.float32), persistent=False)
+        self.register_buffer("axes", torch.tensor(INSTRUCTION_AXES, dtype=torch.float32), persistent=False)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def fit_normalisation(self, proprio: Tensor) -> None:
@@ -248,10 +241,10 @@ class VisuomotorController(nn.Module, Controller):
         normal = ((proprio - self.proprio_mean) / self.proprio_scale).clamp(-_CLIP, _CLIP)
         rest = torch.cat([normal[:, :INERTIAL_SIZE], normal[:, INERTIAL_SIZE + j :]], -1)
         # Shape [M, 1] each.
-        along, left = (x[:, None] for x in self.direction[instruction].unbind(-1))
-        parts = [rest, angle.cos(), angle.sin(), *_turn(angle.cos(), angle.sin(), along, left)]
+        axis = tuple(x[:, None] for x in self.axes[instruction].unbind(-1))
+        parts = [rest, angle.cos(), angle.sin(), *turn_to_instruction(angle.cos(), angle.sin(), *axis)]
         # Positions are clipped like the rest: a robot that is stuck for long must not drown everything else.
-        parts += _turn(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), along, left)
+        parts += turn_to_instruction(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), *axis)
         parts += [functional.one_hot(instruction, len(Instruction)), terminated[:, None]]
         return self.body_encoder(torch.cat([p.to(proprio.dtype) for p in parts], -1))
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import Body
-from mujoban_core.grid import GRID_SIZE, OFFSETS_XY, cell_to_xy, xy_to_cell
+from mujoban_core.grid import GRID_SIZE, INSTRUCTION_AXES, OFFSETS_XY, cell_to_xy, turn_to_instruction, xy_to_cell
 from mujoban_sim.goals import GoalKind, GoalTracker
 
 _NEIGHBOURS = np.array([[x, y] for x in (-1, 0, 1, 2) for y in (-1, 0, 1) if (x, y) != (0, 0)], np.float64)
@@ -43,15 +43,8 @@ def feature_size(proprio_size: int) -> int:
     return proprio_size + 2 + 3 + GOAL_SIZE + (len(GoalKind) - 1) + 3 + 2 + 2 * len(_NEIGHBOURS) + 1
 
 
-def instruction_axes(direction: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the unit vectors along and to the left of instructions in the map frame, [B, 2] each; stay is east."""
-    along = OFFSETS_XY[direction].copy()
-    along[~along.any(1)] = (1.0, 0.0)
-    return along, np.stack([-along[:, 1], along[:, 0]], 1)
-
-
-def _turn(v: NDArray[np.floating], along: NDArray[np.float64], left: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.stack([(v * along).sum(-1), (v * left).sum(-1)], -1)
+def _turn(v: NDArray[np.floating], axis: NDArray[np.float64]) -> NDArray[np.floating]:
+    return np.stack(turn_to_instruction(v[..., 0], v[..., 1], axis[..., 0], axis[..., 1]), -1)
 
 
 def goal_offsets(world: GoalView) -> NDArray[np.float32]:
@@ -60,9 +53,9 @@ def goal_offsets(world: GoalView) -> NDArray[np.float32]:
     The box's offset is zero unless the goal is a push.
     """
     goals, rows = world.goals, np.arange(world.batch)
-    axes = instruction_axes(goals.direction)
-    robot = _turn(goals.robot_target - world.pose[:, :2], *axes)
-    box = _turn(goals.box_target - world.box_position[rows, goals.box_index], *axes)
+    axis = INSTRUCTION_AXES[goals.direction]
+    robot = _turn(goals.robot_target - world.pose[:, :2], axis)
+    box = _turn(goals.box_target - world.box_position[rows, goals.box_index], axis)
     box[goals.kind != GoalKind.PUSH] = 0.0
     return (np.concatenate([robot, box], 1) / world.body.cell_size).astype(np.float32)
 
@@ -75,30 +68,30 @@ def privileged_features(world: GoalView, elapsed: NDArray[np.float64]) -> NDArra
         elapsed: Share of the instruction's time limit that has passed, [B].
     """
     goals, rows, size = world.goals, np.arange(world.batch), world.body.cell_size
-    axes = instruction_axes(goals.direction)
+    axis = INSTRUCTION_AXES[goals.direction]
     push = (goals.kind == GoalKind.PUSH)[:, None]
     heading = np.stack([np.cos(world.pose[:, 2]), np.sin(world.pose[:, 2])], 1)
     box = world.box_position[rows, goals.box_index]
     parts = [
         np.clip(world.proprio / 5.0, -3.0, 3.0),
-        _turn(heading, *axes),
-        _turn(world.velocity[:, :2] / size, *axes),
+        _turn(heading, axis),
+        _turn(world.velocity[:, :2] / size, axis),
         world.velocity[:, 2:] / 5.0,
         2.0 * goal_offsets(world),
         np.eye(len(GoalKind) - 1)[np.minimum(goals.kind, GoalKind.HOLD)],
-        np.where(push, _turn(box - world.pose[:, :2], *axes) / size, 0.0),
+        np.where(push, _turn(box - world.pose[:, :2], axis) / size, 0.0),
         np.where(push, world.box_speed[rows, goals.box_index][:, None] / size, 0.0),
-        2.0 * _turn(world.pose[:, :2] - cell_to_xy(goals.origin_cell, size), *axes) / size,
-        _surroundings(world, *axes),
+        2.0 * _turn(world.pose[:, :2] - cell_to_xy(goals.origin_cell, size), axis) / size,
+        _surroundings(world, axis),
         elapsed[:, None],
     ]
     return np.concatenate(parts, 1).astype(np.float32)
 
 
-def _surroundings(world: GoalView, along: NDArray[np.float64], left: NDArray[np.float64]) -> NDArray[np.float64]:
+def _surroundings(world: GoalView, along: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return whether a wall, and whether a box, is in each of the cells around the origin cell, [B, 22]."""
     rows = np.arange(world.batch)[:, None]
-    origin = cell_to_xy(world.goals.origin_cell)
+    origin, left = cell_to_xy(world.goals.origin_cell), np.stack([-along[:, 1], along[:, 0]], 1)
     around = origin[:, None] + _NEIGHBOURS[:, :1] * along[:, None] + _NEIGHBOURS[:, 1:] * left[:, None]
     cells = np.clip(xy_to_cell(around), 0, GRID_SIZE - 1)
     wall = world.wall[rows, cells[..., 0], cells[..., 1]]

@@ -18,16 +18,18 @@ from numpy.typing import NDArray
 from mujoban_controller.goal_features import goal_offsets
 from mujoban_controller.goal_task import GoalTask
 from mujoban_core.grid import OFFSETS_XY
+from mujoban_sim.driving import SteeringGains, limit_speed, plot_course, roll_and_steer
 from mujoban_sim.goals import GoalKind
 
 
 @dataclass(frozen=True)
-class TeacherGains:
-    """Gains of the scripted teacher; lengths in cells, speeds in cells per second, angles in radians."""
+class TeacherGains(SteeringGains):
+    """Gains of the scripted teacher; lengths in cells, speeds in cells per second, angles in radians.
+
+    It creeps on with `least_speed` until the termination signal comes.
+    """
 
     speed: float = 1.5
-    least_speed: float = 0.15
-    """Speed with which it creeps on until the termination signal comes."""
     move_braking: float = 3.3
     """Speed per cell that is left of a move, or of the way back to a lane or centre."""
     push_braking: float = 4.0
@@ -37,19 +39,13 @@ class TeacherGains:
     push_lag: float = 0.08
     """Seconds by which it brakes earlier than that: the wheel's lag."""
     lane_tolerance: float = 0.3
-    """Distance from the lane beyond which it recentres before it drives on."""
     move_lane_gain: float = 1.5
     """Weight of the distance from the lane in the direction to drive in."""
     push_lane_gain: float = 2.5
     """The same for pushes. There are 0.3 cells until it touches the box: if it still bends to its lane then, friction
     drags the box across, and the box may come to rest between the next pegs, out of tolerance for good."""
     look_ahead: float = 0.5
-    turn_limit: float = 0.5
-    """Heading error above which it turns on the spot."""
-    roll_feed_forward: float = 0.5
     roll_gain: float = 1.0
-    steer_gain: float = 1.5
-    steer_damping: float = 0.05
     hold_radius: float = 0.06
     """Distance from the centre within which it stands still when it is to hold."""
     overshot: float = 0.1
@@ -74,45 +70,21 @@ def scripted_driver(task: GoalTask, offset: NDArray[np.float64] | None = None) -
     move = (goals.kind == GoalKind.MOVE) & (to_target[:, 0] >= -g.overshot)
     lane = OFFSETS_XY[goals.direction] * (push | move)[:, None]
     target = goals.robot_target if offset is None else goals.robot_target + offset
-    to_goal = (target - world.pose[:, :2]) / world.body.cell_size
-    along = (to_goal * lane).sum(-1)
-    aside = to_goal - along[:, None] * lane
-    off_lane = np.linalg.norm(aside, axis=-1)
-    recentre = ~lane.any(-1) | (off_lane > g.lane_tolerance)
-
     lane_gain = np.where(push, g.push_lane_gain, g.move_lane_gain)[:, None]
-    error = _heading_error(
-        np.where(recentre[:, None], aside, aside * lane_gain + lane * g.look_ahead), world.pose[:, 2]
-    )
-    backwards = recentre & (np.abs(error) > np.pi / 2)
-    error = np.where(backwards, _wrap(error + np.pi), error)
-
-    left = np.where(recentre, off_lane, along)
-    wanted = np.where(push & ~recentre, _push_speed(offsets[:, 2], task.forward_speed), g.move_braking * left)
-    speed = np.clip(wanted, g.least_speed, g.speed)
-    speed *= np.clip(np.cos(error), 0.0, 1.0) ** 4 * (np.abs(error) <= g.turn_limit)
-    speed = np.where(backwards, -speed, speed)
+    course = plot_course(target, world.pose, lane, lane_gain, g, world.body.cell_size)
+    left = np.where(course.recentre, course.off_lane, course.along)
+    pushed = _push_speed(offsets[:, 2], task.forward_speed)
+    speed = limit_speed(np.where(push & ~course.recentre, pushed, g.move_braking * left), g.speed, course, g)
     # The course to a centre that is reached already is noise, which a student could only learn as such.
     holding = ~(push | move) & (np.linalg.norm(to_target, axis=1) < g.hold_radius)
-    speed, error = np.where(holding, 0.0, speed), np.where(holding, 0.0, error)
-
-    roll = g.roll_feed_forward * speed + g.roll_gain * (speed - task.forward_speed)
-    steer = g.steer_gain * error - g.steer_damping * world.velocity[:, 2]
-    return np.clip(np.stack([roll, steer], -1), -1.0, 1.0).astype(np.float32)
+    speed, error = np.where(holding, 0.0, speed), np.where(holding, 0.0, course.error)
+    return roll_and_steer(speed, error, task.forward_speed, world.velocity[:, 2], g)
 
 
-def _push_speed(box_left: NDArray[np.float64], speed: NDArray[np.float32]) -> NDArray[np.float64]:
+def _push_speed(box_left: NDArray[np.float64], speed: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the speed for a box with `box_left` cells to go: a constant deceleration that ends in creeping."""
     g = GAINS
     left = np.maximum(box_left - g.push_lag * np.maximum(speed, 0.0), 0.0)
     joint = g.push_deceleration / g.push_braking
     steady = np.sqrt(np.maximum(2.0 * g.push_deceleration * left - joint**2, 0.0))
     return np.where(left < joint / g.push_braking, g.push_braking * left, steady)
-
-
-def _heading_error(course: NDArray[np.floating], heading: NDArray[np.floating]) -> NDArray[np.floating]:
-    return _wrap(np.arctan2(course[:, 1], course[:, 0]) - heading)
-
-
-def _wrap(angle: NDArray[np.floating]) -> NDArray[np.floating]:
-    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -8,7 +8,7 @@ column 0 the westernmost, as in a level text.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Final
+from typing import Any, Final, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,7 +53,33 @@ OFFSETS_XY: Final[NDArray[np.float64]] = np.array(
 )
 """Unit step in the map frame of each instruction, [5, 2]."""
 
+INSTRUCTION_AXES: Final[NDArray[np.float64]] = np.where(OFFSETS_XY.any(1, keepdims=True), OFFSETS_XY, (1.0, 0.0))
+"""x-axis, in the map frame, of the frame in which each instruction points along +x, [5, 2]; stay's points east."""
+
 _HALF: Final = (GRID_SIZE - 1) / 2
+
+
+class Arithmetic(Protocol):
+    """An array or a tensor."""
+
+    def __add__(self, other: Any, /) -> Self: ...
+    def __sub__(self, other: Any, /) -> Self: ...
+    def __mul__(self, other: Any, /) -> Self: ...
+
+
+Values = TypeVar("Values", bound=Arithmetic)
+
+
+def turn_to_instruction(x: Values, y: Values, axis_x: Values, axis_y: Values) -> tuple[Values, Values]:
+    """Return vectors of the map in the frame of an instruction: (along it, to its left).
+
+    Args:
+        x: East, arrays or tensors of any shape.
+        y: North.
+        axis_x: East of the instruction's row of `INSTRUCTION_AXES`; broadcast.
+        axis_y: North of it.
+    """
+    return x * axis_x + y * axis_y, y * axis_x - x * axis_y
 
 
 def cell_to_xy(cell: ArrayLike, cell_size: float = CELL_SIZE) -> NDArray[np.float64]:

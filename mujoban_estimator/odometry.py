@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from mujoban_core.bodies import Body
-from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_LIMIT, OFFSETS_XY
+from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_LIMIT, OFFSETS_XY, turn_to_instruction
 
 FEATURES: Final = 24
 """Features of a tick beside raw proprioception; see `Odometry.forward`."""
@@ -119,9 +119,8 @@ def turn(vector: Tensor, direction: Tensor) -> Tensor:
     """
     east = direction.new_tensor([1.0, 0.0])
     axis = torch.where((direction == 0).all(dim=-1, keepdim=True), east, direction)
-    along = (vector * axis).sum(dim=-1)
-    across = vector[..., 1] * axis[..., 0] - vector[..., 0] * axis[..., 1]
-    return torch.stack([along, across], dim=-1)
+    turned = turn_to_instruction(vector[..., 0], vector[..., 1], axis[..., 0], axis[..., 1])
+    return torch.stack(turned, dim=-1)
 
 
 def _advance(track: Track, velocity: Tensor, direction: Tensor, terminated: Tensor) -> Track:

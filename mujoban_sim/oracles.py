@@ -24,6 +24,7 @@ from mujoban_core.interfaces import (
     Termination,
     TerminationInput,
 )
+from mujoban_sim.driving import SteeringGains, forward_speed, limit_speed, plot_course, roll_and_steer
 from mujoban_sim.goals import GoalKind, GoalTracker
 from mujoban_sokoban.rules import apply
 from mujoban_sokoban.solver import MAX_NODES, Status, solve
@@ -150,34 +151,19 @@ class OraclePlanner(Planner):
 
 
 @dataclass(frozen=True)
-class DrivingGains:
-    """Gains of the scripted driver; lengths in cells, speeds in cells per second, angles in radians."""
+class DrivingGains(SteeringGains):
+    """Gains of the oracle; lengths in cells, speeds in cells per second, angles in radians."""
 
     move_speed: float = 1.5
     push_speed: float = 1.0
-    least_speed: float = 0.15
-    """Speed to which the robot slows down at its goal."""
     braking: float = 3.0
     """Speed per cell of distance left."""
-    lane_tolerance: float = 0.12
-    """Distance from the lane beyond which the robot recentres before it drives on."""
     lane_gain: float = 1.5
     """Weight of the distance from the lane in the direction to drive in."""
-    look_ahead: float = 0.4
-    turn_limit: float = 0.5
-    """Heading error above which the robot turns on the spot."""
-    roll_feed_forward: float = 0.5
-    roll_gain: float = 0.5
-    steer_gain: float = 1.5
-    steer_damping: float = 0.05
 
 
 class OracleController(Controller):
-    """A scripted driver that knows where everything is: turn, drive along the lane, reverse to recentre.
-
-    The lane of an instruction is the line through its goal in its direction. Off the lane, or when it holds its
-    cell, the robot recentres first, backwards if that is nearer.
-    """
+    """A scripted driver that knows where everything is: turn, drive along the lane, reverse to recentre."""
 
     privileged = True
 
@@ -221,34 +207,17 @@ def drive(goals: GoalTracker, truth: GroundTruth, gains: DrivingGains) -> NDArra
         truth: where everything is.
         gains: the driver's gains.
     """
-    g = gains
+    g, size = gains, BALL.cell_size
     pose, velocity = truth.pose.astype(np.float64), truth.velocity.astype(np.float64)
     push = goals.kind == GoalKind.PUSH
     # Shape [B, 2]; zero where the robot holds its cell.
     lane = OFFSETS_XY[goals.direction] * (push | (goals.kind == GoalKind.MOVE))[:, None]
-    to_goal = (goals.robot_target - pose[:, :2]) / BALL.cell_size
-    along = (to_goal * lane).sum(-1)
-    aside = to_goal - along[:, None] * lane
-    off_lane = np.linalg.norm(aside, axis=-1)
-    recentre = ~lane.any(-1) | (off_lane > g.lane_tolerance)
-
-    course = np.where(recentre[:, None], aside, aside * g.lane_gain + lane * g.look_ahead)
-    error = _wrap(np.arctan2(course[:, 1], course[:, 0]) - pose[:, 2])
-    backwards = recentre & (np.abs(error) > np.pi / 2)
-    error = np.where(backwards, _wrap(error + np.pi), error)
-
+    course = plot_course(goals.robot_target, pose, lane, g.lane_gain, g, size)
     box = truth.box_position[np.arange(len(pose)), goals.box_index]
-    box_left = ((goals.box_target - box) / BALL.cell_size * lane).sum(-1)
-    left = np.where(recentre, off_lane, np.maximum(np.where(push, box_left, along), 0.0))
-    speed = np.clip(g.braking * left, g.least_speed, np.where(push, g.push_speed, g.move_speed))
-    speed *= np.clip(np.cos(error), 0.0, 1.0) ** 4 * (np.abs(error) <= g.turn_limit)
-    speed = np.where(backwards, -speed, speed)
-
-    heading = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], -1)
-    forward_speed = (velocity[:, :2] * heading).sum(-1) / BALL.cell_size
-    roll = g.roll_feed_forward * speed + g.roll_gain * (speed - forward_speed)
-    steer = g.steer_gain * error - g.steer_damping * velocity[:, 2]
-    return np.clip(np.stack([roll, steer], -1), -1.0, 1.0).astype(np.float32)
+    box_left = ((goals.box_target - box) / size * lane).sum(-1)
+    left = np.where(course.recentre, course.off_lane, np.maximum(np.where(push, box_left, course.along), 0.0))
+    speed = limit_speed(g.braking * left, np.where(push, g.push_speed, g.move_speed), course, g)
+    return roll_and_steer(speed, course.error, forward_speed(pose, velocity, size), velocity[:, 2], g)
 
 
 def _with_absent(box_position: NDArray[np.float32], count: int) -> NDArray[np.float32]:
@@ -258,7 +227,3 @@ def _with_absent(box_position: NDArray[np.float32], count: int) -> NDArray[np.fl
     """
     missing = max(0, count - box_position.shape[1])
     return np.pad(box_position.clip(-_ABSENT, _ABSENT), ((0, 0), (0, missing), (0, 0)), constant_values=_ABSENT)
-
-
-def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    return (angle + np.pi) % (2 * np.pi) - np.pi
