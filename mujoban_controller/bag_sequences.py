@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mujoban_controller.controller import Recurrent, VisuomotorController
 from mujoban_controller.goal_features import drift, privileged_features
-from mujoban_controller.goal_task import GoalTaskConfig
+from mujoban_controller.goal_task import GoalTaskConfig, goal_reward
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.replay import memory_fields
 from mujoban_core.bodies import Body, get_body
@@ -29,6 +29,7 @@ from mujoban_core.interfaces import Memory
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
 from mujoban_msgs_py.bags.training import episode_ticks, find_bags, open_training_bag
+from mujoban_sim.driving import forward_speed
 from mujoban_sim.goals import GoalTracker
 
 TOPICS: Final = (
@@ -167,12 +168,8 @@ def _rewards(
     """Return the goal task's rewards for the torques of all ticks but the last, [L - 1]."""
     now = np.arange(view.batch - 1)
     before, after = view.at(now, now), view.at(now + 1, now)
-    reward = config.completed_reward * completed + config.failed_reward * failed
-    reward -= config.drift_penalty * np.maximum(drift(after) - drift(before), 0.0)
-    heading = after.pose[:, 2]
-    forward = after.velocity[:, 0] * np.cos(heading) + after.velocity[:, 1] * np.sin(heading)
-    reward -= config.backwards_penalty * (forward / view.body.cell_size < -0.05)
-    return reward.astype(np.float32)
+    forward = forward_speed(after.pose, after.velocity, view.body.cell_size)
+    return goal_reward(config, completed, failed, drift(after) - drift(before), forward)
 
 
 class BagSequences:

@@ -31,6 +31,7 @@ from mujoban_controller.instructions import (
 )
 from mujoban_core.grid import COMPLETION_TOLERANCE, DIFFICULTIES, INSTRUCTION_LIMIT, Instruction
 from mujoban_core.interfaces import ControllerInput, Planner, put_rows, take_rows
+from mujoban_sim.driving import forward_speed
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.presets import DEFAULT_WORLD, get_world
 from mujoban_sim.world import World
@@ -39,6 +40,8 @@ from mujoban_sokoban.levels import LevelError
 
 EpisodeSource = Callable[[], EpisodeSpec]
 """Yields the next episode to play."""
+_BACKWARDS = -0.05
+"""Speed in cells per second below which a robot counts as moving backwards."""
 _REMEMBERED = 256
 """Failures that are kept to be tried again."""
 
@@ -154,6 +157,28 @@ class TaskStep(NamedTuple):
     """Episodes that ended."""
 
 
+def goal_reward(
+    config: GoalTaskConfig,
+    completed: NDArray[np.bool_],
+    failed: NDArray[np.bool_],
+    drifted: NDArray[np.float64],
+    forward: NDArray[np.floating],
+) -> NDArray[np.float32]:
+    """Return the reward of one step (paper C.3), [B].
+
+    Args:
+        config: Rewards and penalties.
+        completed: Where an instruction ended with this step, and is completed, [B].
+        failed: Where one ran out of time with it, [B].
+        drifted: By how much more than before boxes stand off the middle of their lanes, in cells, [B].
+        forward: Speed along the heading behind the step in cells per second, [B].
+    """
+    reward = config.completed_reward * completed + config.failed_reward * failed
+    reward -= config.drift_penalty * np.maximum(drifted, 0.0)
+    reward -= config.backwards_penalty * (forward < _BACKWARDS)
+    return reward.astype(np.float32)
+
+
 class GoalTask:
     """B robots that follow instructions; the instruction in force is chosen before each step.
 
@@ -214,11 +239,9 @@ class GoalTask:
         return self._noise.elapsed / INSTRUCTION_LIMIT
 
     @property
-    def forward_speed(self) -> NDArray[np.float32]:
+    def forward_speed(self) -> NDArray[np.floating]:
         """Speed along the heading in cells per second, [B]."""
-        heading, velocity = self.world.pose[:, 2], self.world.velocity
-        along = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
-        return along / np.float32(self.world.body.cell_size)
+        return forward_speed(self.world.pose, self.world.velocity, self.world.body.cell_size)
 
     def observe(self, *, camera: bool = True) -> ControllerInput:
         """Return what controllers see in this tick, ground truth included; without `camera` frames are empty."""
@@ -238,9 +261,7 @@ class GoalTask:
         completed = world.completed.copy()
         ended = self._noise.step(completed, self._distance()) | world.done
         failed = ended & ~completed & (self._noise.elapsed >= config.terminations.limit)
-        reward = config.completed_reward * (ended & completed) + config.failed_reward * failed
-        reward -= config.drift_penalty * np.maximum(drift(world) - before, 0.0)
-        reward -= config.backwards_penalty * (self.forward_speed < -0.05)
+        reward = goal_reward(config, ended & completed, failed, drift(world) - before, self.forward_speed)
         if config.retry > 0.0:
             self._remember(np.flatnonzero(failed & (world.goals.kind != GoalKind.HOLD)))
         rows = np.flatnonzero(ended)
@@ -257,7 +278,7 @@ class GoalTask:
             self._begin_episodes(np.flatnonzero(over))
         if rows.size:
             self._issue(rows)
-        return TaskStep(reward.astype(np.float32), (~(failed | over)).astype(np.float32), outcomes, episodes)
+        return TaskStep(reward, (~(failed | over)).astype(np.float32), outcomes, episodes)
 
     def _remember(self, rows: NDArray[np.int64]) -> None:
         """Keep the situations in which the instructions in force began, to be tried again."""
