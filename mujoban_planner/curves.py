@@ -34,7 +34,7 @@ def read_curve(run: Path, difficulty: int) -> list[tuple[float, float, float]]:
         OSError: If the run has no metrics.
     """
     lines = (json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines())
-    key = f"solve_rate/{difficulty}"
+    key = f"evaluation/solve_rate/{difficulty}"
     return [(line["step"], line["seconds"], line[key]) for line in lines if key in line]
 
 
@@ -50,7 +50,7 @@ def main() -> None:
     for name, curve in curves.items():
         for axis, column, scale in ((axes[0], 0, 1e3), (axes[1], 1, 60.0)):
             axis.plot([point[column] / scale for point in curve], [point[2] for point in curve], ".-", label=name)
-    axes[0].set(xlabel="thousand samples (MPO: updates)", ylabel=f"solve rate, difficulty {options.difficulty}")
+    axes[0].set(xlabel="thousand samples (MPO: instructions)", ylabel=f"solve rate, difficulty {options.difficulty}")
     axes[1].set(xlabel="minutes of training")
     for axis in axes:
         axis.grid(alpha=0.3)

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import os
 import queue
+import time
 from multiprocessing import get_context
 from multiprocessing.queues import Queue
+from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Final
@@ -25,6 +27,7 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import Game, play
 from mujoban_planner.samples import Samples, concatenate, make_batch
 from mujoban_planner.teacher import Teacher, label_deadly, possible_pushes
+from mujoban_rl.engine import State
 from mujoban_rl.weights import WeightsError
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 from mujoban_sokoban.levels import LevelBatch
@@ -72,6 +75,21 @@ class LessonMaker:
         self._teacher = Teacher()
         self._judged = judged
         self._lost: dict[int, LevelBatch] = {}
+
+    def state(self) -> State:
+        """Return all that changes: levels used up, random state, levels that were lost."""
+        lost = {f"{d}.{name}": array for d, levels in self._lost.items() for name, array in levels._asdict().items()}
+        values = {"next": self._next, "rng": self._rng.bit_generator.state, "lost": list(self._lost)}
+        return State(values, {name: torch.from_numpy(array) for name, array in lost.items()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._next = state.values["next"]
+        self._rng.bit_generator.state = state.values["rng"]
+        self._lost = {
+            d: LevelBatch(*(state.tensors[f"{d}.{name}"].numpy() for name in LevelBatch._fields))
+            for d in state.values["lost"]
+        }
 
     def levels(self, n: int) -> dict[int, LevelBatch]:
         """Return `n` fresh levels by difficulty."""
@@ -210,9 +228,16 @@ class LessonProcess:
         self._stop: Event = context.Event()
         self.demonstrations: Queue[Samples] = context.Queue(maxsize=2)
         self.corrections: Queue[Samples] = context.Queue(maxsize=2)
-        arguments = (stream, mix, judged, weights, niceness, self._stop, self.demonstrations, self.corrections)
+        self._spent = context.Value("d", 0.0)
+        queues = (self.demonstrations, self.corrections)
+        arguments = (stream, mix, judged, weights, niceness, self._stop, self._spent, *queues)
         self._process = context.Process(target=_make_lessons, args=arguments, daemon=True)
         self._process.start()
+
+    @property
+    def cpu_seconds(self) -> float:
+        """CPU time that the process has used."""
+        return self._spent.value
 
     def take(self, source: Queue[Samples], wait: bool) -> Samples | None:
         """Return the next samples of a queue, or None when there are none yet and `wait` is false.
@@ -245,6 +270,7 @@ def _make_lessons(
     weights: Path,
     niceness: int,
     stop: Event,
+    spent: Synchronized[float],
     demonstrations: Queue[Samples],
     corrections: Queue[Samples],
 ) -> None:
@@ -255,6 +281,7 @@ def _make_lessons(
     version = 0.0
     while not stop.is_set() and os.getppid() != 1:
         busy = True
+        spent.value = time.process_time()
         if not demonstrations.full():
             demonstrations.put(maker.demonstrations())
         elif not corrections.full() and weights.exists():

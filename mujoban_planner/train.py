@@ -11,7 +11,7 @@ import tyro
 
 from mujoban_planner import load
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
-from mujoban_planner.imitation import ImitationConfig, ImitationTrainer
+from mujoban_planner.imitation import ImitationConfig, imitation
 from mujoban_planner.reinforcement import MPOConfig, MPOTrainer
 from mujoban_rl.engine import Cadence
 
@@ -41,13 +41,9 @@ class Imitation:
     def main(self) -> None:
         """Train."""
         torch.set_num_threads(self.threads)
-        trainer = ImitationTrainer(self.config, self.run, device=self.device, processes=self.processes)
-        trainer.run(
-            seconds=self.seconds,
-            samples=self.samples,
-            evaluate_every=self.evaluate_every,
-            save_every=self.save_every,
-        )
+        cadence = Cadence(evaluate_seconds=self.evaluate_every, save_seconds=self.save_every)
+        trainer = imitation(self.config, self.run, cadence, device=self.device, processes=self.processes)
+        trainer.run(limit_seconds=self.seconds, limit_samples=self.samples)
 
 
 @dataclass(frozen=True)
@@ -118,8 +114,8 @@ def main() -> None:
     command = tyro.extras.subcommand_cli_from_dict(commands)
     try:
         command.main()
-    except ValueError as error:
-        print(f"train: {error}", file=sys.stderr)
+    except (ValueError, OSError) as error:
+        print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
 
 

@@ -19,12 +19,13 @@ from mujoban_planner import bag_transitions, train
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.decision import count_visits, initial_thoughts, initial_visits
 from mujoban_planner.growth import start_from
-from mujoban_planner.imitation import ImitationConfig, ImitationTrainer, imitation_loss
+from mujoban_planner.imitation import ImitationConfig, imitation, imitation_loss
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
 from mujoban_planner.reinforcement import LevelStream, MPOConfig, MPOTrainer, reset_stay_logit
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
+from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import WeightsError, save_weights
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 
@@ -35,31 +36,50 @@ SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
 def _quick(monkeypatch):
     torch.set_num_threads(1)
     monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
-    monkeypatch.setattr("mujoban_planner.imitation._STOCK_BATCHES", 4)
+    monkeypatch.setattr("mujoban_planner.lesson_source._STOCK_BATCHES", 4)
     monkeypatch.setattr("mujoban_planner.lessons._PLAY_LIMIT", 8)
+    monkeypatch.setattr(LessonMaker.demonstrations, "__defaults__", (24,))
+    monkeypatch.setattr(LessonMaker.corrections, "__defaults__", (8,))
 
 
-def _imitate(path, samples, config=None):
-    trainer = ImitationTrainer(config or ImitationConfig(**SMALL, buffer=50_000), path, processes=0)
-    trainer.run(seconds=None, samples=samples, evaluate_every=math.inf, save_every=math.inf)
+def _imitation(path, **changes):
+    return imitation(ImitationConfig(**SMALL | {"buffer": 50_000} | changes), path, processes=0)
+
+
+def _imitate(path, samples):
+    trainer = _imitation(path)
+    trainer.run(limit_samples=samples)
     return trainer
 
 
 def test_imitation_learns_resumes_and_writes_a_loadable_planner(tmp_path):
     trainer = _imitate(tmp_path, 96)
-    assert trainer.samples == 96
+    assert trainer.progress.samples == 96
     again = _imitate(tmp_path, 128)
-    assert again.samples == 128 and again.bits == 2
+    assert again.progress.samples == 128 and again.progress.updates == 8
     planner = mujoban_planner.load(tmp_path / "planner.safetensors")
-    assert planner.config == again.network.config
+    assert planner.config == again.learner.network.config
     record = json.loads((tmp_path / "planner.json").read_text())
     assert record["samples"] == 128 and "solve_rate/1" in record["metrics"]
 
 
-def test_the_same_run_gives_the_same_weights(tmp_path):
-    one, other = (_imitate(tmp_path / name, 96) for name in ("a", "b"))
-    for a, b in zip(one.network.parameters(), other.network.parameters(), strict=True):
-        assert torch.equal(a, b)
+def test_imitation_that_is_terminated_and_resumed_equals_one_that_never_stopped(tmp_path, monkeypatch):
+    # Corrections of its own play come in from the second batch on.
+    monkeypatch.setattr("mujoban_planner.lesson_source._STOCK_BATCHES", 1)
+    monkeypatch.setattr("mujoban_planner.lesson_source._ENOUGH", 200)
+    check_resuming(_imitation, tmp_path, stop_at=4, updates=7)
+
+
+def test_imitation_refuses_a_batch_with_nan(tmp_path):
+    check_refusal(_imitation(tmp_path), lambda batch: batch._replace(value=batch.value * math.nan))
+
+
+def test_lessons_come_from_a_process_beside(tmp_path):
+    config = ImitationConfig(**SMALL, buffer=50_000, mix=(1.0, 0.0, 0.0, 0.0, 0.0))
+    trainer = imitation(config, tmp_path, processes=1)
+    trainer.run(limit_updates=1)
+    assert trainer.progress.updates == 1
+    assert trainer.source.statistics()["demonstrations"] > 0 and trainer.source.worker_cpu_seconds() > 0
 
 
 def test_a_small_batch_can_be_learned_by_heart():
