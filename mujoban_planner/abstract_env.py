@@ -17,12 +17,14 @@ from torch import Tensor
 
 from mujoban_core.grid import GRID_SIZE, OFFSETS_RC, Instruction
 from mujoban_planner.teacher import STEP_REWARD
+from mujoban_rl.engine import State
 from mujoban_sokoban.levels import Level
 from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD
 
 MOVE_LIMIT: Final = 120
 """Instructions of an abstract episode."""
 _CELLS: Final = GRID_SIZE * GRID_SIZE
+_CHANGING: Final = ("wall", "target", "box", "agent", "moves")
 
 
 class AbstractStep(NamedTuple):
@@ -148,6 +150,20 @@ class AbstractEnvironment:
         reward = torch.where(over, 0.0, reward + STEP_REWARD)
         truncated = (failed | (self.moves >= self.move_limit)) & ~solved
         return AbstractStep(reward, solved, truncated, failed)
+
+    def state(self) -> State:
+        """Return all that changes."""
+        tensors = {name: getattr(self, name) for name in _CHANGING}
+        if self._generator is not None:
+            tensors["generator"] = self._generator.get_state()
+        return State(tensors=tensors)
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` of an environment of as many levels returned."""
+        for name in _CHANGING:
+            setattr(self, name, state.tensors[name].to(self.device))
+        if self._generator is not None:
+            self._generator.set_state(state.tensors["generator"])
 
     def _failures(self, instruction: Tensor) -> Tensor:
         if self.failure_rate == 0.0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 import tyro
@@ -12,7 +13,8 @@ import tyro
 from mujoban_planner import load
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.imitation import ImitationConfig, imitation
-from mujoban_planner.reinforcement import MPOConfig, MPOTrainer
+from mujoban_planner.reinforcement import MPOConfig, reinforcement
+from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
 
 
@@ -57,7 +59,7 @@ class MPO:
     bags: tuple[Path, ...] = ()
     """Recorded bags whose transitions join the replay."""
     device: str = "cpu"
-    """Device of network, environment and replay."""
+    """Device of the network, and of actors in the same process."""
     seconds: float | None = None
     """Stop after so many seconds; a later call resumes."""
     updates: float = float("inf")
@@ -68,21 +70,21 @@ class MPO:
     """Seconds between checkpoints."""
     threads: int = 1
     """Threads of the network on a CPU."""
+    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
     config: tyro.conf.OmitArgPrefixes[MPOConfig] = field(default_factory=MPOConfig)
 
     def main(self) -> None:
         """Train."""
         torch.set_num_threads(self.threads)
         init = load(self.init, self.device, compiled=False) if self.init is not None else None
-        trainer = MPOTrainer(
-            self.config, self.run, device=self.device, init=init, init_path=self.init, bags=self.bags
+        cadence = Cadence(
+            log_updates=50, publish_updates=5, evaluate_seconds=self.evaluate_every, save_seconds=self.save_every
         )
-        trainer.run(
-            seconds=self.seconds,
-            updates=self.updates,
-            evaluate_every=self.evaluate_every,
-            save_every=self.save_every,
-        )
+        trainer = reinforcement(
+            self.config, self.run, cadence, device=self.device, actors=self.actors, init=init, init_path=self.init,
+            bags=self.bags,
+        )  # fmt: skip
+        trainer.run(limit_seconds=self.seconds, limit_updates=self.updates)
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ from mujoban_planner.decision import count_visits, initial_thoughts, initial_vis
 from mujoban_planner.growth import start_from
 from mujoban_planner.imitation import ImitationConfig, imitation, imitation_loss
 from mujoban_planner.lessons import LessonMaker
+from mujoban_planner.moves import LevelStream
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
-from mujoban_planner.reinforcement import LevelStream, MPOConfig, MPOTrainer, reset_stay_logit
+from mujoban_planner.reinforcement import MPOConfig, MPOLearner, reinforcement, reset_stay_logit
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_rl.testing import check_refusal, check_resuming
@@ -130,21 +131,30 @@ def test_hidden_states_show_what_was_in_view_and_guess_the_rest():
     assert torch.equal(some[: len(truth) - half], truth[: len(truth) - half])
 
 
-def test_mpo_resumes_and_writes_a_loadable_planner(tmp_path):
-    config = MPOConfig(
-        channels=8, blocks=1, environments=8, batch_size=8, warm_up_steps=8, replay_steps=50, failure_rate=0.1
-    )
-    for updates in (4, 8):
-        trainer = MPOTrainer(config, tmp_path)
-        trainer.run(seconds=None, updates=updates, evaluate_every=math.inf, save_every=math.inf)
-        assert trainer.updates == updates
+def _mpo(path, **changes):
+    small = {"environments": 8, "batch_size": 8, "warm_up_steps": 8, "replay_steps": 50, "play": 3, "n_step": 2}
+    return reinforcement(MPOConfig(channels=8, blocks=1, failure_rate=0.1, **small | changes), path)
+
+
+def test_mpo_writes_a_loadable_planner(tmp_path):
+    trainer = _mpo(tmp_path)
+    trainer.run(limit_updates=4)
+    assert trainer.progress.updates == 4 and trainer.progress.samples >= 8 * (8 + 4)
     assert mujoban_planner.load(tmp_path / "planner.safetensors").config["channels"] == 8
 
 
+def test_mpo_that_is_terminated_and_resumed_equals_one_that_never_stopped(tmp_path):
+    # The target network follows, and actors get new weights, on both sides of the stop.
+    check_resuming(lambda path: _mpo(path, target_period=2), tmp_path, stop_at=5, updates=12)
+
+
+def test_mpo_refuses_a_batch_with_nan(tmp_path):
+    check_refusal(_mpo(tmp_path), lambda batch: batch._replace(reward=batch.reward * math.nan))
+
+
 @pytest.mark.parametrize("propagation", [True, False])
-def test_a_planner_by_mpo_alone_is_not_led_by_verdicts_that_nobody_taught_it(tmp_path, propagation):
-    config = MPOConfig(channels=8, blocks=1, environments=8, warm_up_steps=8, propagation=propagation)
-    planner = MPOTrainer(config, tmp_path).network.eval()
+def test_a_planner_by_mpo_alone_is_not_led_by_verdicts_that_nobody_taught_it(propagation):
+    planner = MPOLearner(MPOConfig(channels=8, blocks=1, propagation=propagation)).network.eval()
     states = abstract_states(generate_batch(3, range(1000, 1016)))
     scores = []
     for caution in (0.0, 4.0):

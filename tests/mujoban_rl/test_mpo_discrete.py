@@ -4,7 +4,6 @@ import torch
 from mujoban_rl.losses.mpo import improve
 from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
 from mujoban_rl.losses.returns import windowed_returns
-from mujoban_rl.replay import TimeMajorReplay
 
 # A walk on 6 cells with 5 actions (left, right, stay, stay, stay): +1 at the right end. gamma = 0.9.
 STATES, ACTIONS, GAMMA = 6, 5, 0.9
@@ -90,17 +89,3 @@ def test_returns_stop_at_the_end_of_an_episode_and_at_dropped_steps():
     assert returns.bootstrap.tolist() == [0.125, 0.0, 0.25, 1.0]
     assert returns.index.tolist()[::2] == [3, 2]
     assert returns.valid.tolist() == [True, True, True, False]
-
-
-def test_replay_windows_are_successive_steps_of_one_environment():
-    replay = TimeMajorReplay(8, 3, {"value": ((), torch.int64)})
-    generator = torch.Generator().manual_seed(0)
-    with pytest.raises(ValueError, match="expected at least"):
-        replay.sample(1, 2, generator)
-    for step in range(20):
-        replay.add({"value": torch.arange(3) * 1000 + step})
-    window = replay.sample(200, 2, generator)["value"]
-    assert torch.equal(window[:, 1:], window[:, :-1] + 1)
-    assert set((window % 1000).flatten().tolist()) == set(range(12, 20))
-    with pytest.raises(ValueError, match="expected"):
-        replay.add({"other": torch.zeros(3)})
