@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_core.bodies import INERTIAL_SIZE, get_body
+from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE, CameraMount, project
 from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
@@ -193,7 +193,8 @@ class VisuomotorController(nn.Module, Controller):
         # Joint positions are replaced by two sine-cosine pairs; A is one-hot, beta one bit.
         inputs = self.proprio_size + 3 * self.joints + len(Instruction) + 1 + _TRACK - 1
         # A root of slides has a hinge for its heading; a free one has to do with its turns since the start.
-        self.heading_joint = layout.joint_qpos.index(3) if layout.root == "slides" else None
+        self.heading_index = layout.heading_index
+        self.part = layout.proprio
         self.cell_size = layout.cell_size
         shrink = 2 ** (len(channels) - 1)
         self.first_row = rows_of_sky(layout.camera, shrink)
@@ -223,9 +224,10 @@ class VisuomotorController(nn.Module, Controller):
 
     def reckon(self, proprio: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
         """Return the track after one more tick, [B, 7], from o_pr [B, P], beta [B] and the track before, [B, 7]."""
-        j = self.heading_joint
-        heading = torch.zeros_like(proprio[:, 0]) if j is None else proprio[:, INERTIAL_SIZE + j]
-        return dead_reckoning(track, proprio[:, :2] / self.cell_size, heading, terminated, CONTROL_PERIOD)
+        at = self.heading_index
+        heading = torch.zeros_like(proprio[:, 0]) if at is None else proprio[:, at]
+        velocity = proprio[:, self.part.planar_velocity] / self.cell_size
+        return dead_reckoning(track, velocity, heading, terminated, CONTROL_PERIOD)
 
     def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
         """Return the encoding of all inputs but the frame, [M, F].
@@ -236,10 +238,10 @@ class VisuomotorController(nn.Module, Controller):
             terminated: beta, bool [M].
             track: Dead reckoning, [M, 7].
         """
-        j = self.joints
-        angle = proprio[:, INERTIAL_SIZE : INERTIAL_SIZE + j]
+        part = self.part
+        angle = proprio[:, part.joint_position]
         normal = ((proprio - self.proprio_mean) / self.proprio_scale).clamp(-_CLIP, _CLIP)
-        rest = torch.cat([normal[:, :INERTIAL_SIZE], normal[:, INERTIAL_SIZE + j :]], -1)
+        rest = torch.cat([normal[:, part.inertial], normal[:, part.joint_velocity], normal[:, part.up_axis]], -1)
         # Shape [M, 1] each.
         axis = tuple(x[:, None] for x in self.axes[instruction].unbind(-1))
         parts = [rest, angle.cos(), angle.sin(), *turn_to_instruction(angle.cos(), angle.sin(), *axis)]

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Final, Literal
+from functools import cache, cached_property
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,27 +56,58 @@ class RobotPhysics:
     friction: tuple[float, float, float]
 
 
+class ProprioSlices(NamedTuple):
+    """Where what stands in proprioception o_pr, which has P = 12 + 2 J values for J inner joints."""
+
+    linear_velocity: slice
+    """Velocimeter, in the robot's frame [m/s], 3 values."""
+    angular_velocity: slice
+    """Gyro, in the robot's frame [rad/s], 3 values."""
+    linear_acceleration: slice
+    """Accelerometer, gravity included, in the robot's frame [m/s^2], 3 values."""
+    joint_position: slice
+    """Hinges wrapped to [-pi, pi] [rad], J values."""
+    joint_velocity: slice
+    """[rad/s], J values."""
+    up_axis: slice
+    """The world's z-axis in the robot's frame, 3 values."""
+    size: int
+    """P."""
+    inertial: slice
+    """The first three together."""
+    planar_velocity: slice
+    """Forwards and to the left, the first two values of `linear_velocity`."""
+    yaw_rate: slice
+    """About the robot's z-axis, the last value of `angular_velocity`."""
+
+    @classmethod
+    @cache
+    def of(cls, joints: int) -> ProprioSlices:
+        """Return the slices for a number of joints, J."""
+        velocities = INERTIAL_SIZE + joints
+        up_axis = velocities + joints
+        return cls(
+            linear_velocity=slice(0, 3),
+            angular_velocity=slice(3, 6),
+            linear_acceleration=slice(6, INERTIAL_SIZE),
+            joint_position=slice(INERTIAL_SIZE, velocities),
+            joint_velocity=slice(velocities, up_axis),
+            up_axis=slice(up_axis, up_axis + UP_AXIS_SIZE),
+            size=up_axis + UP_AXIS_SIZE,
+            inertial=slice(0, INERTIAL_SIZE),
+            planar_velocity=slice(0, 2),
+            yaw_rate=slice(5, 6),
+        )
+
+
 @dataclass(frozen=True)
 class Body:
     """Everything that depends on the robot's body.
 
-    Proprioception o_pr has P = 12 + 2 J values, J inner joints in the order of `joints`:
-
-    ====================  ======  ==========================================================
-    slice                 length  meaning
-    ====================  ======  ==========================================================
-    ``[0:3]``             3       velocimeter: linear velocity in the robot's frame [m/s]
-    ``[3:6]``             3       gyro: angular velocity in the robot's frame [rad/s]
-    ``[6:9]``             3       accelerometer, gravity included, in the robot's frame [m/s^2]
-    ``[9:9+J]``           J       joint positions, hinges wrapped to [-pi, pi] [rad]
-    ``[9+J:9+2J]``        J       joint velocities [rad/s]
-    ``[9+2J:12+2J]``      3       the world's z-axis in the robot's frame
-    ====================  ======  ==========================================================
-
     Attributes:
         name: key in `BODIES`.
         root: kind of root, see the module's docstring.
-        joints: names of the proprioceptive joints (hinges).
+        joints: names of the J proprioceptive joints (hinges), in the order of proprioception.
         joint_qpos: their offsets among the robot's positions.
         joint_qvel: their offsets among the robot's velocities.
         actuators: motors in the order of the torque's U components.
@@ -108,7 +139,17 @@ class Body:
     @property
     def proprio_size(self) -> int:
         """P, the number of proprioceptive values."""
-        return INERTIAL_SIZE + 2 * len(self.joints) + UP_AXIS_SIZE
+        return self.proprio.size
+
+    @cached_property
+    def proprio(self) -> ProprioSlices:
+        """Where what stands in proprioception."""
+        return ProprioSlices.of(len(self.joints))
+
+    @property
+    def heading_index(self) -> int | None:
+        """Where the heading stands in proprioception; None for a free root, which does not feel it."""
+        return self.proprio.joint_position.start + self.joint_qpos.index(3) if self.root == "slides" else None
 
     @property
     def qpos_size(self) -> int:

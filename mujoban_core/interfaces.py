@@ -30,7 +30,7 @@ class Observation(NamedTuple):
     frame: NDArray[np.uint8]
     """o_cam, first-person camera, RGB [B, 64, 64, 3]."""
     proprio: NDArray[np.float32]
-    """o_pr, [B, P]; layout in `mujoban_core.bodies`."""
+    """o_pr, [B, P]; layout in `mujoban_core.bodies.ProprioSlices`."""
     pose: NDArray[np.float32]
     """o_pos = (x [m], y [m], psi [rad]) in the map frame, [B, 3]."""
 

@@ -54,9 +54,10 @@ class Odometry:
         Raises:
             ValueError: if the body does not feel its heading.
         """
-        if "steer" not in body.joints:
-            raise ValueError(f"body {body.name} has no joint 'steer': expected one that tells its heading")
-        self.heading = 9 + body.joints.index("steer")
+        if body.heading_index is None:
+            raise ValueError(f"body {body.name} has a free root: expected one with a joint that tells its heading")
+        self.heading = body.heading_index
+        self.part = body.proprio
         self.cell_size = body.cell_size
 
     def initial(self, batch: int, device: torch.device | str = "cpu") -> Track:
@@ -77,7 +78,7 @@ class Odometry:
         """
         psi = proprio[..., self.heading]
         cos, sin = psi.cos(), psi.sin()
-        ahead, left = proprio[..., 0] / self.cell_size, proprio[..., 1] / self.cell_size
+        ahead, left = (proprio[..., self.part.planar_velocity] / self.cell_size).unbind(-1)
         velocity = torch.stack([ahead * cos - left * sin, ahead * sin + left * cos], dim=-1)  # [B, T, 2]
         offsets = torch.as_tensor(OFFSETS_XY, dtype=proprio.dtype, device=proprio.device)
         direction = offsets[instruction]
@@ -99,7 +100,7 @@ class Odometry:
         columns = [
             turn(heading, direction),  # 2
             turn(velocity, direction),  # 2
-            proprio[..., 5:6] / 4,  # 1: yaw rate
+            proprio[..., self.part.yaw_rate] / 4,  # 1: yaw rate
             turn(track.position - track.start, direction).clamp(-2, 2),  # 2
             target.clamp(-2, 2), (target * 5).clamp(-2, 2),  # 4
             home.clamp(-2, 2), (home * 5).clamp(-2, 2),  # 4

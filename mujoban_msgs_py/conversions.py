@@ -24,7 +24,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import Header
 
-from mujoban_core.bodies import BODIES
+from mujoban_core.bodies import BODIES, ProprioSlices
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, DIFFICULTIES, GRID_SIZE
 from mujoban_core.grid import Instruction as Direction
@@ -119,24 +119,23 @@ def camera_info_from_msg(message: Any) -> NDArray[np.float64]:
 
 
 def proprio_to_msg(header: Header, proprio: ArrayLike, joints: Sequence[str]) -> Proprioception:
-    """Return o_pr, [P], in the layout of `mujoban_core.bodies.Body`, of a body with these joints."""
-    count = len(joints)
-    values = _finite("proprio", proprio, (12 + 2 * count,), np.float64).tolist()
-    linear, angular, acceleration = (_vector(values[i : i + 3]) for i in (0, 3, 6))
+    """Return o_pr, [P], in the layout of `mujoban_core.bodies.ProprioSlices`, of a body with these joints."""
+    part = ProprioSlices.of(len(joints))
+    values = _finite("proprio", proprio, (part.size,), np.float64).tolist()
     return Proprioception(
         header=header,
         name=list(joints),
-        position=array("d", values[9 : 9 + count]),
-        velocity=array("d", values[9 + count : 9 + 2 * count]),
-        linear_velocity=linear,
-        angular_velocity=angular,
-        linear_acceleration=acceleration,
-        world_z_axis=_vector(values[-3:]),
+        position=array("d", values[part.joint_position]),
+        velocity=array("d", values[part.joint_velocity]),
+        linear_velocity=_vector(values[part.linear_velocity]),
+        angular_velocity=_vector(values[part.angular_velocity]),
+        linear_acceleration=_vector(values[part.linear_acceleration]),
+        world_z_axis=_vector(values[part.up_axis]),
     )
 
 
 def proprio_from_msg(message: Any) -> NDArray[np.float32]:
-    """Return o_pr, [P], in the layout of `mujoban_core.bodies.Body`."""
+    """Return o_pr, [P], in the layout of `mujoban_core.bodies.ProprioSlices`."""
     count = len(message.name)
     if not len(message.position) == len(message.velocity) == count:
         raise ConversionError(
@@ -146,7 +145,7 @@ def proprio_from_msg(message: Any) -> NDArray[np.float32]:
     values = [c for field in _INERTIAL for v in (getattr(message, field),) for c in (v.x, v.y, v.z)]
     axis = message.world_z_axis
     values += [*message.position, *message.velocity, axis.x, axis.y, axis.z]
-    return _finite("proprioception", values, (12 + 2 * count,), np.float32)
+    return _finite("proprioception", values, (ProprioSlices.of(count).size,), np.float32)
 
 
 def body_proprio_from_msg(message: Any) -> NDArray[np.float32]:

@@ -112,7 +112,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     | key | space | meaning | sets |
     |---|---|---|---|
     | ``frame`` | uint8 (64, 64, 3) | first-person camera, RGB | default, privileged |
-    | ``proprio`` | float32 (P,) | proprioception, see `mujoban_core.bodies.Body`; P = 16 | all |
+    | ``proprio`` | float32 (P,) | proprioception, see `mujoban_core.bodies.ProprioSlices`; P = 16 | all |
     | ``pose`` | float32 (3,) | x, y, yaw of the robot | all |
     | ``velocity`` | float32 (3,) | vx, vy, yaw rate in the frame ``map`` | state, privileged |
     | ``box_position`` | float32 (K, 2) | box centres; absent boxes lie 100 m away | state, privileged |

@@ -57,7 +57,7 @@ class World:
         preset: the physical world's figures.
         pose: (x [m], y [m], psi [rad], in [-pi, pi]) of the robot, float32 [B, 3].
         velocity: (vx [m/s], vy [m/s], yaw rate [rad/s]) in the map frame, float32 [B, 3].
-        proprio: o_pr, layout in `mujoban_core.bodies.Body`, float32 [B, P].
+        proprio: o_pr, layout in `mujoban_core.bodies.ProprioSlices`, float32 [B, P].
         box_position: o_box, float32 [B, K, 2]; boxes that a level lacks lie far outside the grid.
         box_speed: [m/s], float32 [B, K].
         box_count: boxes of each level, int64 [B].

@@ -126,7 +126,7 @@ def driven(rng, heading, speed, ticks):
     """Proprioception of a robot that drives straight on, [1, T, P]."""
     proprio = np.zeros((1, ticks, BALL.proprio_size), np.float32)
     proprio[..., 0] = speed
-    proprio[..., 10] = heading
+    proprio[..., BALL.heading_index] = heading
     return proprio
 
 

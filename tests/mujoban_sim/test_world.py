@@ -61,7 +61,7 @@ def test_an_episode_starts_as_its_level_says_and_at_rest():
     assert np.allclose(world.pose[0, :2], cell_to_xy(START))
     assert np.allclose(world.box_position[0], cell_to_xy(ROOM.boxes))
     assert world.agent_cell[0].tolist() == list(START)
-    assert np.allclose(world.proprio[0, 6:9], [0, 0, 9.81], atol=1e-3)
+    assert np.allclose(world.proprio[0, world.body.proprio.linear_acceleration], [0, 0, 9.81], atol=1e-3)
     assert not world.velocity.any()
     rest(world, 40)
     assert np.allclose(world.pose[0, :2], cell_to_xy(START), atol=1e-4)
@@ -381,8 +381,8 @@ def test_another_body_needs_no_more_than_its_description(monkeypatch):
         world.step(np.full((2, 1), 0.5, np.float32))
     assert world.proprio.shape == (2, 14)
     # The arm turns, its joint is observed, and the robot stands upright.
-    assert (world.proprio[:, 10] > 0.5).all()
-    assert np.allclose(world.proprio[:, 11:], [0, 0, 1], atol=0.02)
+    assert (world.proprio[:, world.body.proprio.joint_velocity] > 0.5).all()
+    assert np.allclose(world.proprio[:, world.body.proprio.up_axis], [0, 0, 1], atol=0.02)
 
 
 def test_a_level_may_have_any_number_of_boxes():
