@@ -102,7 +102,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     | 0 | roll: drives the ball forwards (+) or backwards | 20 N m |
     | 1 | steer: turns the robot to its left (+) or right | 20 N m |
 
-    A torque that is NaN or outside [-1, 1] raises `mujoban_sim.world.TorqueError`; wrap the environment in
+    A torque that is NaN or outside [-1, 1] raises `mujoban_sim.checks.TorqueError`; wrap the environment in
     ``gymnasium.wrappers.ClipAction`` for policies without bounds.
 
     ## Observation space

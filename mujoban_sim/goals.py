@@ -160,11 +160,15 @@ class GoalTracker:
         self.box_target[rows] = cell_to_xy(result.boxes[np.arange(len(rows)), index], self.cell_size)
         self.reached[rows] = False
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all arrays by name, not copied; the batch is on the first axis."""
+        return {name: getattr(self, name) for name in _ARRAYS}
+
     def memory(self) -> tuple[NDArray[Any], ...]:
-        """Return a copy of all arrays, for a module that tracks goals itself; the batch is on the first axis."""
-        return tuple(getattr(self, name).copy() for name in _ARRAYS)
+        """Return a copy of all arrays, for a module that tracks goals itself."""
+        return tuple(array.copy() for array in self.arrays().values())
 
     def restore(self, memory: Sequence[NDArray[Any]]) -> None:
         """Take over a copy of the arrays that `memory` returned."""
-        for name, values in zip(_ARRAYS, memory, strict=True):
-            getattr(self, name)[:] = values
+        for array, values in zip(self.arrays().values(), memory, strict=True):
+            array[:] = values

@@ -7,7 +7,7 @@ All positions are metres in the frame ``map``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
 import numpy as np
@@ -18,14 +18,17 @@ from mujoban_core.bodies import FIRST_PERSON_CAMERA, get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET, WALL, cell_to_xy, xy_to_cell
 from mujoban_core.interfaces import GroundTruth, Observation
+from mujoban_sim.cameras import Cameras
+from mujoban_sim.checks import check_levels, check_rows, hand_over_torque
 from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
 from mujoban_sim.presets import DEFAULT_WORLD, get_world
 from mujoban_sim.scene import BOX_COORDINATES, SceneCache, settled_positions
-from mujoban_sim.world_kernels import KernelState, apply_torque, pack, update
+from mujoban_sim.snapshots import Snapshot, check_snapshot, decode_episodes, encode_episodes
+from mujoban_sim.world_kernels import KernelState, pack, update
 from mujoban_sokoban.episodes import EpisodeSpec
 
 if TYPE_CHECKING:
-    from mujoban_sim.rendering import CameraName, FrameRenderer
+    from mujoban_sim.rendering import CameraName
 
 _STAGE_NONE: Final = int(mujoco.mjtStage.mjSTAGE_NONE)
 _STAGE_VELOCITY: Final = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -33,8 +36,11 @@ _HEADING_STREAM: Final = 1
 """Tells the heading's random stream from others that an episode's seed governs."""
 
 
-class TorqueError(ValueError):
-    """A torque has the wrong shape, is not finite or lies outside [-1, 1]; the world has not moved."""
+_DYNAMIC: Final = (
+    "pose", "velocity", "proprio", "box_position", "box_speed", "agent_cell", "box_cell", "box_on_target",
+    "boxes_on_target", "_abstract_state", "reward", "episode_return", "steps", "solved", "truncated",
+)  # fmt: skip
+"""Attributes that change within an episode, besides those of physics and goals."""
 
 
 def initial_heading(seed: int) -> float:
@@ -117,9 +123,8 @@ class World:
         self.goals = GoalTracker(batch, cell_size=self.body.cell_size, tolerance=tolerance, max_box_speed=max_box_speed)
         self._threads = threads
         self._all_rows = self._live = np.arange(batch)
-        self._renderers: dict[int, FrameRenderer] = {}
+        self._cameras = Cameras(batch, self.body, max_boxes, threads, self.preset)
         self._episodes: list[EpisodeSpec | None] = [None] * batch
-        self._undrawn: dict[int, set[int]] = {}
         self._started = False
         self._allocate()
         self._start_physics(cached_scenes)
@@ -201,31 +206,10 @@ class World:
         Raises:
             ValueError: if the numbers differ, a row is out of range or appears twice, or a level has too many boxes.
         """
-        chosen = self._check_rows(rows)
+        chosen = check_rows(rows, self.batch)
         if len(chosen) != len(episodes):
             raise ValueError(f"{len(chosen)} rows but {len(episodes)} episodes: expected one each")
-        for episode in episodes:
-            if len(episode.level.boxes) > self.max_boxes:
-                raise ValueError(
-                    f"level {episode.level.name!r} has {len(episode.level.boxes)} boxes: "
-                    f"expected at most max_boxes = {self.max_boxes}"
-                )
-        models = [self._scenes.model(e.level.wall) for e in episodes]
-        for row, episode, model in zip(chosen.tolist(), episodes, models, strict=True):
-            level = episode.level
-            self._episodes[row] = episode
-            self._models[row] = model
-            self.wall[row], self.target[row] = level.wall, level.target
-            self._abstract_state[row] = 0.0
-            self._abstract_state[row, ..., WALL], self._abstract_state[row, ..., TARGET] = level.wall, level.target
-            self.box_count[row] = len(level.boxes)
-            self._target_cell[row] = -1
-            self._target_cell[row, : len(level.boxes)] = np.argwhere(level.target)
-            self.agent_cell[row] = level.player
-        self._started = self._started or None not in self._episodes
-        for undrawn in self._undrawn.values():
-            undrawn.update(chosen.tolist())
-        self._physics.set_models(self._models)
+        self._begin(chosen, episodes)
         for counter in (self.reward, self.episode_return, self.steps, self.solved, self.truncated):
             counter[chosen] = 0
         self._live = np.flatnonzero(~self.done)
@@ -238,6 +222,25 @@ class World:
             boxes[m, : len(episode.level.boxes)] = cell_to_xy(episode.level.boxes, self.body.cell_size)
         self._write_state(chosen, pose, boxes)
 
+    def _begin(self, rows: NDArray[np.int64], episodes: Sequence[EpisodeSpec]) -> None:
+        """Put the levels of episodes into rows."""
+        check_levels(episodes, self.max_boxes)
+        models = [self._scenes.model(e.level.wall) for e in episodes]
+        for row, episode, model in zip(rows.tolist(), episodes, models, strict=True):
+            level = episode.level
+            self._episodes[row] = episode
+            self._models[row] = model
+            self.wall[row], self.target[row] = level.wall, level.target
+            self._abstract_state[row] = 0.0
+            self._abstract_state[row, ..., WALL], self._abstract_state[row, ..., TARGET] = level.wall, level.target
+            self.box_count[row] = len(level.boxes)
+            self._target_cell[row] = -1
+            self._target_cell[row, : len(level.boxes)] = np.argwhere(level.target)
+            self.agent_cell[row] = level.player
+        self._started = self._started or None not in self._episodes
+        self._cameras.renew(rows)
+        self._physics.set_models(self._models)
+
     def place(self, rows: ArrayLike, pose: ArrayLike, box_position: ArrayLike) -> None:
         """Put robots and boxes somewhere, at rest, without reward; the instructions in force stay.
 
@@ -249,7 +252,7 @@ class World:
         Raises:
             ValueError: if a shape is wrong, a number is not finite or a row has no episode.
         """
-        chosen = self._check_rows(rows)
+        chosen = check_rows(rows, self.batch)
         poses, boxes = np.asarray(pose, np.float64), np.asarray(box_position, np.float64)
         expected = (len(chosen), 3), (len(chosen), self.max_boxes, 2)
         if (poses.shape, boxes.shape) != expected:
@@ -273,6 +276,41 @@ class World:
             body.set_pose(q[root:], pose[m])
         self._physics.forward(ids=rows)
         update(rows, False, self._kernel_state)
+
+    def snapshot(self, rows: ArrayLike) -> Snapshot:
+        """Return everything that decides how the given rows, int [M], go on, as arrays with M on the first axis.
+
+        A world of the same body, preset, boxes and settings that restores it continues to the last bit.
+
+        Raises:
+            ValueError: if a row is out of range or has no episode.
+        """
+        chosen = check_rows(rows, self.batch)
+        episodes = [self._episodes[row] for row in chosen.tolist()]
+        return {name: array[chosen] for name, array in self._dynamic().items()} | encode_episodes(episodes)
+
+    def restore(self, rows: ArrayLike, snapshot: Snapshot) -> None:
+        """Bring rows, int [M], into the state of a `snapshot`, instructions in force included.
+
+        Raises:
+            ValueError: if a row is out of range, or the snapshot is not one of M rows of such a world; nothing has
+                changed then.
+        """
+        chosen, dynamic = check_rows(rows, self.batch), self._dynamic()
+        check_snapshot(snapshot, {name: (len(chosen), *array.shape[1:]) for name, array in dynamic.items()})
+        self._begin(chosen, decode_episodes(snapshot))
+        self._physics.reset(ids=chosen, stage=_STAGE_NONE)
+        for name, array in dynamic.items():
+            array[chosen] = snapshot[name]
+        self._live = np.flatnonzero(~self.done)
+
+    def _dynamic(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays, each [B, ...], that change within an episode."""
+        return {
+            **{name: self._physics.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")},
+            **{name: getattr(self, name) for name in _DYNAMIC},
+            **{f"goals.{name}": array for name, array in self.goals.arrays().items()},
+        }
 
     def instruct(self, instruction: NDArray[np.int64], issued: NDArray[np.bool_]) -> None:
         """Tell which instructions A_t the coming steps follow.
@@ -298,13 +336,9 @@ class World:
             TorqueError: if they have another shape, are not finite or lie outside [-1, 1]; nothing has moved then.
             RuntimeError: if a row has never been reset.
         """
-        action = np.asarray(torque)
-        if action.shape != self._ctrl.shape:
-            raise TorqueError(f"torques have shape {action.shape}: expected {self._ctrl.shape}")
         if not self._started:
             raise RuntimeError("rows without an episode: call reset on all rows before step")
-        if not apply_torque(action, self._ctrl):
-            raise TorqueError(_torque_message(action))
+        hand_over_torque(np.asarray(torque), self._ctrl)
         live = self._live
         if len(live) == self.batch:
             self._physics.step(nstep=self.preset.substeps, stage=_STAGE_VELOCITY)
@@ -349,27 +383,10 @@ class World:
             RenderingError: if there is no OpenGL.
             ValueError: if an argument is out of its range or a row has never been reset.
         """
-        chosen = self._all_rows if rows is None else self._check_rows(rows)
-        renderer = self._renderer(size)
-        undrawn = self._undrawn[size]
-        for row in undrawn.intersection(chosen.tolist()):
-            episode = self._episodes[row]
-            if episode is None:
-                raise ValueError(f"row {row} has no episode: call reset before render")
-            renderer.set_episode(row, episode.level, episode.seed)
-            undrawn.discard(row)
-        return renderer.render(self._qpos, self._pressed(), self.box_on_target, chosen, camera)
-
-    def _renderer(self, size: int) -> FrameRenderer:
-        if size not in self._renderers:
-            # Worlds without a camera need no OpenGL.
-            from mujoban_sim.rendering import FrameRenderer
-
-            self._renderers[size] = FrameRenderer(
-                self.batch, self.body, self.max_boxes, size, self._threads, preset=self.preset
-            )
-            self._undrawn[size] = set(self._all_rows.tolist())
-        return self._renderers[size]
+        chosen = self._all_rows if rows is None else check_rows(rows, self.batch)
+        return self._cameras.render(
+            camera, size, chosen, self._episodes, self._qpos, self._pressed(), self.box_on_target
+        )
 
     def _pressed(self) -> NDArray[np.bool_]:
         """Return which pads carry a box, pads in row-major order, [B, K]."""
@@ -379,20 +396,4 @@ class World:
 
     def close(self) -> None:
         """Free the OpenGL contexts; they open again when needed."""
-        for renderer in self._renderers.values():
-            renderer.close()
-        self._renderers.clear()
-        self._undrawn.clear()
-
-    def _check_rows(self, rows: ArrayLike) -> NDArray[np.int64]:
-        chosen = np.atleast_1d(np.asarray(rows, np.int64))
-        if chosen.size and (chosen.min() < 0 or chosen.max() >= self.batch):
-            raise ValueError(f"rows {chosen.tolist()}: expected 0 to {self.batch - 1}")
-        if len(set(chosen.tolist())) != len(chosen):
-            raise ValueError(f"rows {chosen.tolist()}: expected each once")
-        return chosen
-
-
-def _torque_message(action: NDArray[np.float32]) -> str:
-    bad = np.argwhere(~(np.abs(action) <= 1.0))[0]
-    return f"torque {action[tuple(bad)]} of actuator {bad[1]} in row {bad[0]}: expected a finite number in [-1, 1]"
+        self._cameras.close()

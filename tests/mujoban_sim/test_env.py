@@ -7,9 +7,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import mujoban_sim  # noqa: F401 - registers the environment
+from mujoban_sim.checks import TorqueError
 from mujoban_sim.env import OBSERVATION_SETS, MujobanEnv
 from mujoban_sim.vector_env import MujobanVectorEnv
-from mujoban_sim.world import TorqueError
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import TEST_SEEDS, generate_level
 from mujoban_sokoban.levels import Level

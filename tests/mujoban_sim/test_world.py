@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from safetensors.numpy import load_file, save_file
 
 from mujoban_core.bodies import BALL, BODIES, Actuator
 from mujoban_core.grid import AGENT, BOX, TARGET, WALL, Instruction, cell_to_xy, xy_to_cell
+from mujoban_sim.checks import TorqueError
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.presets import WORLDS
-from mujoban_sim.world import TorqueError, World, initial_heading
+from mujoban_sim.world import World, initial_heading
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import generate_levels
 from mujoban_sokoban.levels import Level
@@ -392,3 +394,47 @@ def test_a_level_may_have_any_number_of_boxes():
     world.reset([0], [EpisodeSpec(level, 0)])
     random_run(world, 50, seed=0)
     assert np.array_equal(world.box_cell[0], level.boxes)
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_a_restored_snapshot_continues_to_the_last_bit_in_any_row_of_another_world(name, tmp_path):
+    levels = generate_levels(5, range(3))
+    world = World(3, world=name, time_limit=200)
+    world.reset([0, 1, 2], [EpisodeSpec(level, i) for i, level in enumerate(levels)])
+    instruct = np.array([Instruction.EAST, Instruction.NORTH, Instruction.WEST])
+    world.instruct(instruct, np.ones(3, bool))
+    random_run(world, 60, seed=1)
+    save_file(dict(world.snapshot([2, 0])), tmp_path / "rows.safetensors")
+    expected = random_run(world, 150, seed=2)
+    again = World(3, world=name, time_limit=200, threads=2)
+    again.reset([0, 1, 2], [EpisodeSpec(levels[1], 9)] * 3)
+    random_run(again, 20, seed=3)
+    again.render(size=16)
+    again.restore([0, 2], load_file(tmp_path / "rows.safetensors"))
+    assert np.array_equal(again.goals.goal_cell[[2, 0]], world.goals.goal_cell[[0, 2]])
+    assert again.episodes[2] == world.episodes[0] and again.episodes[0] == world.episodes[2]
+    # The torques of rows 0 and 2 change places with them.
+    rng = np.random.default_rng(2)
+    for trace in expected:
+        again.step(rng.uniform(-1, 1, (3, 2)).astype(np.float32)[[2, 1, 0]])
+        found = np.concatenate([again.qpos, again.proprio, again.reward[:, None]], 1)
+        assert np.array_equal(found[[2, 0]], trace[[0, 2]])
+    for field in ("steps", "truncated", "episode_return", "box_cell", "completed"):
+        assert np.array_equal(getattr(again, field)[[2, 0]], getattr(world, field)[[0, 2]])
+    assert again.truncated[[0, 2]].all()
+    assert np.array_equal(again.render(size=16)[[2, 0]], world.render(size=16)[[0, 2]])
+
+
+def test_what_is_no_snapshot_of_these_rows_changes_nothing():
+    world = room_world()
+    kept = world.snapshot([0])
+    before = world.qpos.copy()
+    for damage, message in (
+        ({"qvel": kept["qvel"] * np.nan}, "qvel"), ({"steps": np.zeros(2, np.int64)}, r"steps.*\(2,\)"),
+        ({"episode.level": kept["episode.level"][:, :5]}, "."),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            world.restore([0], {**kept, **damage})
+    with pytest.raises(ValueError, match="lacks qpos"):
+        world.restore([0], {})
+    assert np.array_equal(world.qpos, before)

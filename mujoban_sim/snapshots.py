@@ -1,0 +1,71 @@
+"""What a world's rows need to go on elsewhere: a flat dict of arrays, M rows on the first axis of each.
+
+`mujoban_sim.world.World.snapshot` and `restore` make and take them. They hold numbers only, so safetensors carry them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.levels import Level
+
+Snapshot = Mapping[str, NDArray[Any]]
+"""Arrays by name, each [M, ...]."""
+
+_LEVEL, _SEED, _LEVEL_SEED = "episode.level", "episode.seed", "episode.level_seed"
+_NO_SEED: Final = -1
+
+
+def encode_episodes(episodes: Sequence[EpisodeSpec | None]) -> dict[str, NDArray[Any]]:
+    """Return episodes as arrays: level texts as bytes, [M, L], and seeds, [M].
+
+    Raises:
+        ValueError: if one is None.
+    """
+    specs = [episode for episode in episodes if episode is not None]
+    if len(specs) != len(episodes):
+        raise ValueError("rows without an episode have no snapshot: call reset first")
+    levels = [spec.level for spec in specs]
+    texts = b"".join(level.to_text().encode() for level in levels)
+    return {
+        _LEVEL: np.frombuffer(texts, np.uint8).reshape(len(specs), -1).copy(),
+        _SEED: np.array([spec.seed for spec in specs], np.int64),
+        _LEVEL_SEED: np.array([_NO_SEED if level.seed is None else level.seed for level in levels], np.int64),
+    }
+
+
+def decode_episodes(snapshot: Snapshot) -> list[EpisodeSpec]:
+    """Return the episodes of a snapshot; names of levels are not kept.
+
+    Raises:
+        ValueError: if a level is malformed.
+    """
+    levels = [Level.from_text(row.tobytes().decode("ascii", "replace")) for row in snapshot[_LEVEL]]
+    generated = [None if seed == _NO_SEED else seed for seed in snapshot[_LEVEL_SEED].tolist()]
+    return [
+        EpisodeSpec(replace(level, seed=origin), seed)
+        for level, origin, seed in zip(levels, generated, snapshot[_SEED].tolist(), strict=True)
+    ]
+
+
+def check_snapshot(snapshot: Snapshot, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Reject what is not a snapshot with these arrays, and episodes besides.
+
+    Raises:
+        ValueError: if an array is missing, has another shape or is not finite.
+    """
+    rows = next(iter(shapes.values()))[:1]
+    for name, shape in {**shapes, _SEED: rows, _LEVEL_SEED: rows}.items():
+        if name not in snapshot:
+            raise ValueError(f"the snapshot lacks {name}")
+        array = snapshot[name]
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(f"{name} of the snapshot has shape {array.shape}: expected {shape}, all finite")
+    if _LEVEL not in snapshot or snapshot[_LEVEL].shape[:1] != rows or snapshot[_LEVEL].dtype != np.uint8:
+        raise ValueError(f"the snapshot lacks {_LEVEL}: expected level texts as bytes")
