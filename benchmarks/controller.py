@@ -28,7 +28,7 @@ from mujoban_controller.goal_task import GoalTaskConfig
 from mujoban_controller.train import TrainConfig, make_learner
 from mujoban_core.grid import GRID_SIZE, xy_to_cell
 from mujoban_core.interfaces import ControllerInput
-from mujoban_rl.limits import StopSignal
+from mujoban_core.signals import StopSignal
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
 from mujoban_rl.losses.returns import td_target
 from mujoban_sim.world import World

@@ -1,31 +1,33 @@
-"""What the commands have in common: options, module selection, and one line on stderr for bad input."""
+"""What the commands have in common: options, module selection, and one line on stderr for bad input.
+
+Whatever takes long to import is imported where it is used, so that a command can tell its options, and be interrupted,
+at once.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
-import numpy as np
-
+from mujoban_core.children import end_with_parent
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_core.interfaces import Module
 from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
 from mujoban_core.plugins import LEARNED, ORACLE, ROLES, load_module, shipped_weights
-from mujoban_core.sense_plan_act import SensePlanAct
-from mujoban_rl.weights import WeightsError, digest
+from mujoban_core.signals import interrupt_status, interruptible, interruption, leave
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
-from mujoban_sim.rendering import RenderingError
-from mujoban_sokoban.episodes import Episodes
-from mujoban_sokoban.solver import Status, solve_levels
+
+if TYPE_CHECKING:
+    from mujoban_core.interfaces import Module
+    from mujoban_core.sense_plan_act import SensePlanAct
+    from mujoban_sokoban.episodes import Episodes
 
 USAGE_ERROR = 2
 """Exit status of a command whose input was bad."""
-INTERRUPTED = 130
-"""Exit status of a command that was asked to end, as shells have it."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -37,16 +39,35 @@ class Parser(argparse.ArgumentParser):
 
 
 def run_command(prog: str, command: Callable[[], int]) -> NoReturn:
-    """Run a command and leave with its exit status; bad input is one line on stderr and status 2."""
+    """Run a command and end the process with its `exit_status`."""
+    leave(exit_status(prog, command))
+
+
+def exit_status(prog: str, command: Callable[[], int]) -> int:
+    """Run a command and return its exit status.
+
+    Bad input is one line on stderr and status 2; a signal that asks the command to end is status 130 or 143.
+    """
+    end_with_parent()
     try:
-        status = command()
-    except (ValueError, OSError, RenderingError) as error:
-        print(f"{prog}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        status = USAGE_ERROR
-    except KeyboardInterrupt:
-        print(f"{prog}: interrupted", file=sys.stderr)
-        status = INTERRUPTED
-    sys.exit(status)
+        with interruptible():
+            return command()
+    except (ValueError, OSError) as error:
+        if (earlier := interruption(error)) is not None:
+            return interrupt_status(earlier)
+        say(f"{prog}: error: {' '.join(str(error).split())}")
+        return USAGE_ERROR
+    except KeyboardInterrupt as error:
+        say(f"{prog}: interrupted")
+        return interrupt_status(error)
+    except SystemExit as leaving:
+        return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
+
+
+def say(line: str) -> None:
+    """Print a line on stderr, if that can still be written to: the terminal may have been closed."""
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
 
 
 @dataclass(frozen=True)
@@ -78,6 +99,8 @@ class Choice:
         Raises:
             WeightsError: If the weights are missing.
         """
+        from mujoban_rl.weights import WeightsError, digest
+
         if self.source != LEARNED:
             return self.source
         path = self.weights or shipped_weights(self.role)
@@ -108,6 +131,8 @@ class Stack:
         Raises:
             ValueError: If a module cannot be loaded, or `look_around` is negative.
         """
+        from mujoban_core.sense_plan_act import SensePlanAct
+
         modules = {role: choice.load(self.device) for role, choice in self.choices.items()}
         ticks = self.look_around_ticks
         return SensePlanAct(**{role: look_around(module, ticks) for role, module in modules.items()})  # pyright: ignore
@@ -165,11 +190,14 @@ def add_module_options(parser: argparse.ArgumentParser) -> None:
 
 def episodes_from(arguments: argparse.Namespace) -> Episodes:
     """Return the episodes that the options ask for; say on stderr which levels of a file are unsolvable."""
+    from mujoban_sokoban.episodes import Episodes
+    from mujoban_sokoban.solver import Status, solve_levels
+
     episodes = Episodes(
         arguments.episodes, arguments.seed, difficulty=arguments.difficulty, level_file=arguments.levels
     )
     if episodes.source.levels:
-        for index in np.flatnonzero(solve_levels(episodes.source.levels).status == Status.UNSOLVABLE):
+        for index in (solve_levels(episodes.source.levels).status == Status.UNSOLVABLE).nonzero()[0]:
             print(f"level {index} of {arguments.levels} is unsolvable; it is played all the same", file=sys.stderr)
     return episodes
 

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,9 +20,11 @@ from rclpy.parameter import Parameter
 from bringup.command import USAGE_ERROR
 from bringup.parameters import Parameters, write_parameters
 from mujoban_controller.node import ControllerNode
+from mujoban_core import children
 from mujoban_estimator.node import EstimatorNode
 from mujoban_estimator.termination_node import TerminationNode
 from mujoban_msgs_py.runtime.module_node import ModuleNode
+from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
 from mujoban_planner.node import PlannerNode
 from mujoban_sim.node import SimulatorNode
 
@@ -42,8 +43,6 @@ RESPAWN_PERIOD = 0.1
 """Seconds between two looks at whether the processes live."""
 RESTART_LIMIT = 20
 """Times that a node is started again before the graph is given up."""
-STOP_TIMEOUT = 5.0
-"""Seconds that a process has to end when it is asked to."""
 
 
 class GraphError(ValueError):
@@ -162,17 +161,10 @@ class Processes:
 
     def stop(self) -> None:
         """End all processes."""
-        for child in self._children.values():
-            child.terminate()
-        deadline = time.monotonic() + STOP_TIMEOUT
-        for child in self._children.values():
-            try:
-                child.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
+        if children.stop(self._children.values()):
+            clear_shared_memory()
         self._directory.cleanup()
 
     def _start(self, name: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", NODES[name].__module__, "--ros-args"]
-        return subprocess.Popen([*command, "--params-file", str(self._parameter_file)])
+        return children.start([*command, "--params-file", str(self._parameter_file)])

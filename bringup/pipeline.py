@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -19,8 +17,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mujoban_core import children
 from mujoban_core.files import write_atomically
-from mujoban_rl.limits import StopSignal
+from mujoban_core.signals import StopSignal
 
 _PERIOD = 0.2
 """Seconds between two looks at the commands that run."""
@@ -167,10 +166,9 @@ class Pipeline:
         log = self._log(stage.name)
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as output:
-            process = subprocess.Popen(
-                [sys.executable, *stage.command], stdin=subprocess.DEVNULL, stdout=output, stderr=output,
-                start_new_session=True, env={**os.environ, "OMP_NUM_THREADS": str(stage.cores)},
-            )  # fmt: skip
+            process = children.start(
+                [sys.executable, *stage.command], {"OMP_NUM_THREADS": str(stage.cores)}, output
+            )
         self._running[stage.name] = (process, time.monotonic())
 
     def _reap(self) -> None:
@@ -198,16 +196,8 @@ class Pipeline:
         self._save()
 
     def _stop_all(self) -> None:
-        for process, _ in self._running.values():
-            process.send_signal(signal.SIGTERM)
-        end = time.monotonic() + _GRACE
+        children.stop((process for process, _ in self._running.values()), _GRACE)
         for name in self.running():
-            process = self._running[name][0]
-            try:
-                process.wait(max(0.0, end - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
             self._finish(name)
 
     def _log(self, name: str) -> Path:

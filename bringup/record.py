@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -28,9 +31,10 @@ from bringup.command import (
 )
 from bringup.exploration import Disturbance, disturbed
 from bringup.rollout import ticks
+from mujoban_core import children
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.sense_plan_act import SensePlanAct
-from mujoban_rl.limits import StopSignal
+from mujoban_core.signals import StopSignal, interrupt_status, interruptible, leave
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec, LazyEpisodes, after_moves
@@ -107,8 +111,18 @@ class Job:
     world: str = DEFAULT_WORLD
 
 
-def record(job: Job, progress: Progress | None = None) -> int:
-    """Play and record the episodes of a job, unless a signal asks to stop; return the number of ticks."""
+def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
+    """Play and record the episodes of a job; return the number of ticks.
+
+    Args:
+        job: What is recorded.
+        on_end: Called with the number of episodes that have ended in a tick, if any.
+
+    Raises:
+        ValueError: If a module cannot be loaded.
+        OSError: If a bag cannot be written.
+        Interrupted: If the process was asked to end; the bags are whole then.
+    """
     import torch
 
     from bringup.rollout_recorder import Recorder
@@ -118,24 +132,106 @@ def record(job: Job, progress: Progress | None = None) -> int:
     if job.disturbance is not None:
         policy = disturbed(policy, job.disturbance, np.random.default_rng(job.seed))
     world = World(min(job.batch, len(job.episodes)), world=job.world, time_limit=job.time_limit)
-    task = None if progress is None else progress.add_task("recorded", total=len(job.episodes))
     difficulties = [job.episodes.difficulty(i) for i in range(len(job.episodes))]
-    recording = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix)
-    with StopSignal() as stop, recording as recorder:
+    recorder = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix)
+    try:
         for tick in ticks(policy, world, job.episodes, camera=True):
-            recorder.write(tick)
-            if stop.requested:
-                break
+            # Play may be cut short anywhere, but not a message.
+            with StopSignal() as stop:
+                recorder.write(tick)
+            stop.check()
             ended = int((tick.solved | tick.truncated).sum())
-            if progress is not None and task is not None and ended:
-                progress.update(task, advance=ended)
+            if ended:
+                on_end(ended)
+    finally:
+        with StopSignal():
+            recorder.close()
     world.close()
     return recorder.ticks
 
 
-def main() -> int:
+class _Answer(NamedTuple):
+    """What a recording process has to say."""
+
+    ended: int = 0
+    """Episodes that have ended since it said something last."""
+    ticks: int | None = None
+    """Ticks recorded in all, once its job is done."""
+    error: str = ""
+    """What is wrong, in one line."""
+
+
+def _work(job: Job, answers: Connection) -> None:
+    """Record a job and tell how it goes."""
+    children.end_with_parent()
+    import_from_here()
+    try:
+        with interruptible():
+            total = record(job, lambda ended: answers.send(_Answer(ended)))
+        answers.send(_Answer(ticks=total))
+    except (ValueError, OSError) as error:
+        answers.send(_Answer(error=str(error) or type(error).__name__))
+    except KeyboardInterrupt as error:
+        leave(interrupt_status(error))
+
+
+@contextmanager
+def working(jobs: Sequence[Job]) -> Iterator[list[Connection]]:
+    """Have a process record each job, and yield where they tell how it goes.
+
+    Those that have not ended when the context does are asked to, and are waited for: their bags are whole then.
+    """
+    context = multiprocessing.get_context("spawn")
+    processes: list[BaseProcess] = []
+    answers: list[Connection] = []
+    try:
+        for job in jobs:
+            ours, theirs = context.Pipe(duplex=False)
+            process = context.Process(target=_work, args=(job, theirs), daemon=True)
+            with children.sheltered():
+                process.start()
+            theirs.close()
+            processes.append(process)
+            answers.append(ours)
+        yield answers
+    finally:
+        with StopSignal():
+            for process in processes:
+                process.terminate()
+            for process in processes:
+                process.join()
+
+
+def gather(answers: Sequence[Connection], on_end: Callable[[int], None]) -> int:
+    """Wait until all recording processes are done; return the number of ticks.
+
+    Args:
+        answers: From `working`.
+        on_end: Called with the number of episodes that have ended.
+
+    Raises:
+        ValueError: If one of them failed.
+    """
+    total, open_ones = 0, list(answers)
+    while open_ones:
+        for connection in wait(open_ones):
+            assert isinstance(connection, Connection)
+            try:
+                answer: _Answer = connection.recv()
+            except EOFError:
+                raise ValueError("a recording process was killed: its last bags lack their end") from None
+            if answer.error:
+                raise ValueError(answer.error)
+            on_end(answer.ended)
+            if answer.ticks is not None:
+                total += answer.ticks
+                open_ones.remove(connection)
+    return total
+
+
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    arguments = _arguments()
+    arguments = _arguments(command_line)
     import_from_here()
     if arguments.out.exists() and any(arguments.out.iterdir()):
         raise ValueError(f"{arguments.out} is not empty: expected a new folder for the bags")
@@ -143,17 +239,14 @@ def main() -> int:
         raise ValueError(f"{arguments.processes} processes, batch {arguments.batch}: expected at least 1")
     jobs = [_job(arguments, part) for part in range(min(arguments.processes, arguments.episodes))]
     arguments.out.mkdir(parents=True, exist_ok=True)
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(len(jobs) - 1) if len(jobs) > 1 else nullcontext() as pool:
-        others = [] if pool is None else [pool.apply_async(record, (job,)) for job in jobs[1:]]
-        with Progress(console=Console(stderr=True)) as progress:
-            total = record(jobs[0], progress)
-        total += sum(other.get() for other in others)
+    with working(jobs) as answers, Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task("recorded", total=arguments.episodes)
+        total = gather(answers, lambda ended: progress.update(task, advance=ended))
     print(f"{total} ticks of {arguments.episodes} episodes in {len(list(arguments.out.iterdir()))} bags")
     return 0
 
 
-def _arguments() -> argparse.Namespace:
+def _arguments(command_line: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(PROG, description="Record many episodes as bags, quickly.")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the bags")
     parser.add_argument("--episodes", type=int, default=256, help="number of episodes")
@@ -171,7 +264,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--undisturbed", action="store_true", help="let the policy do as it will")
     add_world_option(parser)
     add_module_options(parser)
-    return parser.parse_args()
+    return parser.parse_args(command_line)
 
 
 def _job(arguments: argparse.Namespace, part: int) -> Job:

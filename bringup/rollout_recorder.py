@@ -80,6 +80,10 @@ class Recorder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close the bags."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the bags."""
         for row in self._rows.values():
             row.writer.close()
 

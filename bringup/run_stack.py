@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
-
-from rich.console import Console
-from rich.live import Live
+from typing import TYPE_CHECKING
 
 from bringup.command import (
     Parser,
@@ -19,10 +18,11 @@ from bringup.command import (
     run_command,
     stack_from,
 )
-from bringup.monitor import MonitorNode
-from bringup.results import EpisodeResult, report, write_report
-from bringup.stack import Outcome, PlayOptions, play
-from bringup.view import live_view, summary
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from bringup.stack import Outcome
 
 PROG = "run_stack.py"
 
@@ -58,6 +58,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     import_from_here()
     episodes, stack = episodes_from(options), stack_from(options)
+
+    from rich.console import Console
+
+    from bringup.results import report, write_report
+    from bringup.stack import PlayOptions, play
+    from bringup.view import on_terminal
+
     weights = stack.identities()
     console = Console()
     play_options = PlayOptions(
@@ -70,15 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         video=options.video,
         view=options.view,
     )
-    if options.headless:
-        outcome = play(stack, episodes, play_options)
-    else:
-        with Live(console=console, auto_refresh=False) as live:
-
-            def refresh(monitor: MonitorNode, results: Sequence[EpisodeResult]) -> None:
-                live.update(live_view(monitor.episode, monitor.latest, results), refresh=True)
-
-            outcome = play(stack, episodes, play_options, on_refresh=refresh)
+    with nullcontext() if options.headless else on_terminal(console) as on_refresh:
+        outcome = play(stack, episodes, play_options, on_refresh=on_refresh)
     content = report(
         outcome.results,
         weights,
@@ -93,6 +93,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _sum_up(console: Console, outcome: Outcome, interval: Sequence[float]) -> None:
+    from bringup.view import summary
+
     console.print(summary(outcome.results))
     solved, total = sum(r.solved for r in outcome.results), len(outcome.results)
     low, high = (100 * bound for bound in interval)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -24,8 +23,11 @@ from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from bringup.results import EpisodeResult
 from bringup.video import EDGE, VideoNode
+from mujoban_core import children
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_msgs_py.runtime.tick_node import init_ros, noted_signals, spin
+from mujoban_core.signals import StopSignal
+from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
+from mujoban_msgs_py.runtime.tick_node import init_ros, spin
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.episodes import Episodes
 
@@ -86,7 +88,7 @@ def play(
     Raises:
         ValueError: If a module cannot be loaded.
         GraphError: If a node's process could not start.
-        KeyboardInterrupt: If the process was asked to end; bag and video are whole then.
+        Interrupted: If the process was asked to end; bag and video are whole then.
     """
     options = options or PlayOptions()
     parameters = graph_parameters(
@@ -99,7 +101,8 @@ def play(
         top_camera_size=FRAME_SIZE if options.video is None else EDGE,
     )
     with ExitStack() as exits:
-        received = exits.enter_context(noted_signals())
+        stop = exits.enter_context(StopSignal())
+        clear_shared_memory()
         exits.enter_context(claim_domain())
         init_ros()
         exits.callback(rclpy.try_shutdown)
@@ -117,7 +120,7 @@ def play(
             monitor.create_timer(RESPAWN_PERIOD, lambda: _supervise(processes, monitor))
         if on_refresh is not None:
             monitor.create_timer(refresh_period, lambda: on_refresh(monitor, monitor.results))
-        spin(graph.executor, monitor.finished, received)
+        spin(graph.executor, monitor.finished, stop)
         monitor.finished.result()
         if on_refresh is not None:  # a short run may have ended before the first refresh
             on_refresh(monitor, monitor.results)
@@ -150,12 +153,11 @@ def viewer() -> Iterator[None]:
     """
     if find_spec("rerun") is None:
         raise ValueError("the live view needs rerun-sdk: pip install 'mujoban[view]'")
-    process = subprocess.Popen([sys.executable, "-m", "bringup.live"])
+    process = children.start([sys.executable, "-m", "bringup.live"])
     try:
         yield
     finally:
-        process.terminate()
-        process.wait()
+        children.stop([process])
 
 
 def _recorder(path: Path, episodes_per_file: int) -> RecorderNode:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 from mujoban_msgs.msg import Episode
 from numpy.typing import NDArray
 from rich.columns import Columns
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from bringup.monitor import Watched
+from bringup.monitor import MonitorNode, Watched
 from bringup.results import EpisodeResult
 from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, TARGET, WALL, Instruction
 
@@ -79,6 +81,13 @@ def live_view(episode: Episode | None, tick: Watched | None, outcomes: Sequence[
             Panel(grid_text(tick.truth), title="ground truth", height=12, width=24),
         ]
     )
+
+
+@contextmanager
+def on_terminal(console: Console) -> Iterator[Callable[[MonitorNode, Sequence[EpisodeResult]], None]]:
+    """Return what shows the latest tick of a monitor on a terminal, in place of the one before."""
+    with Live(console=console, auto_refresh=False) as live:
+        yield lambda monitor, results: live.update(live_view(monitor.episode, monitor.latest, results), refresh=True)
 
 
 def summary(results: Sequence[EpisodeResult]) -> Table:

@@ -5,7 +5,6 @@ It only subscribes to the graph, so it works beside a running stack and on a bag
 
 from __future__ import annotations
 
-import sys
 from array import array
 from collections import Counter
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from mujoban_core.grid import CELL_SIZE, CHANNELS, TARGET, WALL, cell_to_xy
+from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import Received, listen
@@ -149,4 +149,4 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -28,7 +28,8 @@ from mujoban_controller.judge import OutcomeSummary, judge
 from mujoban_controller.learners import DistilLearner, Learner, ReinforcementLearner
 from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_controller.privileged import PrivilegedPolicy
-from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
+from mujoban_core.signals import StopSignal
+from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.training_log import TrainingLog
 from mujoban_rl.weights import digest, load_weights, provenance, save_weights

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, IterableDataset
 
+from mujoban_core import children
 from mujoban_core.bodies import get_body
 from mujoban_estimator.bag_stream import BagStream
 from mujoban_estimator.data import Batch, Batcher
@@ -102,7 +102,8 @@ class BagSource(Source[Batch]):
             BagError: If a bag is not what is expected (see `BagStream`).
         """
         if self._items is None:
-            self._items = iter(self._loader())
+            with children.sheltered():
+                self._items = iter(self._loader())
         item = next(self._items)
         self._place = item.after
         self._cpu_seconds = item.cpu_seconds if self._workers else 0.0
@@ -116,7 +117,7 @@ class BagSource(Source[Batch]):
             num_workers=self._workers,
             prefetch_factor=_AHEAD if self._workers else None,
             collate_fn=_as_is,  # pyright: ignore[reportArgumentType] - one batch at a time, not a list
-            worker_init_fn=_ignore_interrupts,
+            worker_init_fn=_begin,
             generator=torch.Generator(),  # else the loader draws from the global one
         )
 
@@ -145,6 +146,5 @@ def _as_is(item: _Item) -> _Item:
     return item
 
 
-def _ignore_interrupts(_: int) -> None:
-    """Leave an interrupt from the keyboard to the process that trains, which ends this one."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _begin(_: int) -> None:
+    children.end_with_parent()

@@ -5,7 +5,6 @@ Run it with `python -m mujoban_estimator.termination_node`.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +14,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
 from mujoban_core.interfaces import NO_INSTRUCTION, GroundTruth, TerminationInput
+from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.module_node import ModuleNode
@@ -117,4 +117,4 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_core import children
 from mujoban_planner import load
 from mujoban_planner.boards import join_levels, take_levels
 from mujoban_planner.planner import LearnedPlanner
@@ -232,7 +233,8 @@ class LessonProcess:
         queues = (self.demonstrations, self.corrections)
         arguments = (stream, mix, judged, weights, niceness, self._stop, self._spent, *queues)
         self._process = context.Process(target=_make_lessons, args=arguments, daemon=True)
-        self._process.start()
+        with children.sheltered():
+            self._process.start()
 
     @property
     def cpu_seconds(self) -> float:
@@ -274,12 +276,13 @@ def _make_lessons(
     demonstrations: Queue[Samples],
     corrections: Queue[Samples],
 ) -> None:
+    children.end_with_parent()
     torch.set_num_threads(1)
     os.nice(niceness)
     maker = LessonMaker(stream, mix, judged)
     planner: LearnedPlanner | None = None
     version = 0.0
-    while not stop.is_set() and os.getppid() != 1:
+    while not stop.is_set():
         busy = True
         spent.value = time.process_time()
         if not demonstrations.full():

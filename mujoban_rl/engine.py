@@ -24,7 +24,8 @@ from typing import Any, Generic, TypeVar
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from mujoban_rl.limits import NaNGuard, StopSignal, TimeLimit
+from mujoban_core.signals import StopSignal
+from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.progress import Budget, Clock, Meter, Progress
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.training_log import TrainingLog

@@ -1,12 +1,9 @@
-"""What ends a training run, or a step of it: signals, time, numbers that are not finite."""
+"""What ends a training run, or a step of it: time, numbers that are not finite."""
 
 from __future__ import annotations
 
 import math
-import signal
 import time
-from types import FrameType, TracebackType
-from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -36,34 +33,6 @@ class NaNGuard:
         if self._in_a_row > self.patience:
             raise FloatingPointError(f"training diverged: {self._in_a_row} non-finite steps in a row")
         return finite
-
-
-class StopSignal:
-    """Context in which SIGINT and SIGTERM ask the loop to end instead of killing it."""
-
-    _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-    def __init__(self) -> None:
-        self.requested = False
-        """Whether a signal came; a second SIGINT interrupts at once."""
-        self._previous: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> Self:
-        """Install the handlers."""
-        self._previous = {s: signal.signal(s, self._handle) for s in self._SIGNALS}
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Put the former handlers back."""
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.requested and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.requested = True
 
 
 class TimeLimit:

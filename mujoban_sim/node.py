@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -20,13 +19,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from mujoban_core.files import write_atomically
 from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
+from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.observation import ObservationPublisher
 from mujoban_sim.presets import DEFAULT_WORLD
-from mujoban_sim.rendering import RenderingError
 from mujoban_sim.tick_messages import TickLabel
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
@@ -338,12 +337,8 @@ class SimulatorNode(Node):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node; without OpenGL it ends with one line on stderr and status 2, as for other bad input."""
-    try:
-        return run_node(SimulatorNode, args)
-    except RenderingError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return run_node(SimulatorNode, args)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -39,7 +39,7 @@ CAMERAS: Final[tuple[CameraName, ...]] = (FIRST_PERSON_CAMERA, TOP_DOWN_CAMERA)
 _MAX_GEOMS: Final = 200
 
 
-class RenderingError(RuntimeError):
+class RenderingError(OSError):
     """There is no OpenGL to draw with."""
 
 

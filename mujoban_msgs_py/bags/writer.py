@@ -81,7 +81,8 @@ class BagWriter:
             raise BagError(f"{self.path} exists already: a bag needs a new folder") from None
         self._open_file()
         for topic in topics:
-            self.add_topic(topic.name, topic.type_name, [qos_profile(latched=topic.latched)])
+            self._add(topic.name, topic.type_name, [qos_profile(latched=topic.latched)])
+        self._metadata.write(self.path)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -94,16 +95,18 @@ class BagWriter:
         Raises:
             BagError: If the type is unknown, or the topic is in the bag with another type.
         """
-        known = self._metadata.topics.get(name)
-        if known is not None:
-            if known.type_name != type_name:
-                raise BagError(f"topic {name} of {self.path} is of type {known.type_name}, not {type_name}")
-            return
+        if name not in self._metadata.topics:
+            self._add(name, type_name, qos)
+            self._metadata.write(self.path)
+        elif self._metadata.topics[name].type_name != type_name:
+            known = self._metadata.topics[name].type_name
+            raise BagError(f"topic {name} of {self.path} is of type {known}, not {type_name}")
+
+    def _add(self, name: str, type_name: str, qos: Sequence[Mapping[str, Any]]) -> None:
         profiles = [dict(p) for p in qos] or [qos_profile()]
         record = TopicRecord(name, type_name, self._types.type_hash(type_name), profiles)
         self._metadata.topics[name] = record
         self._register(record)
-        self._metadata.write(self.path)
 
     def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
         """Write one serialised message.

@@ -6,10 +6,11 @@ import argparse
 import importlib
 import importlib.util
 import os
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+
+from mujoban_core.signals import interrupt_status, interruptible
 
 USAGE_ERROR = 2
 FAMILIES = ("bag", "node", "param", "service", "topic")
@@ -19,7 +20,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command.
 
     Returns:
-        Exit status: 0, 2 after one line on stderr about bad input, 130 after an interruption.
+        Exit status: 0, 2 after one line on stderr about bad input, 130 or 143 after an interruption.
     """
     arguments = list(sys.argv[1:] if args is None else args)
     if importlib.util.find_spec("ros2cli") is not None:
@@ -29,8 +30,8 @@ def main(args: Sequence[str] | None = None) -> int:
     other = other_command(os.environ.get("PATH", ""), Path(sys.argv[0]))
     if other is not None:
         os.execve(other, [str(other), *arguments], environment_outside(dict(os.environ), Path(sys.prefix)))
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return run(arguments)
+    with interruptible():
+        return run(arguments)
 
 
 def other_command(path: str, own: Path) -> Path | None:
@@ -74,8 +75,8 @@ def run(arguments: Sequence[str]) -> int:
             return 0
         print(f"ros2: error: {' '.join(str(error).split())}", file=sys.stderr)
         return USAGE_ERROR
-    except KeyboardInterrupt:
-        return 130
+    except KeyboardInterrupt as error:
+        return interrupt_status(error)
 
 
 def make_parser(family: str | None = None) -> argparse.ArgumentParser:

@@ -8,13 +8,10 @@ neighbour which was restarted in between receives what it has missed.
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import threading
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -28,14 +25,16 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
+from mujoban_core.children import end_with_parent
+from mujoban_core.signals import StopSignal, interruptible
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import LOG_PERIOD, reject
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import EPISODE, Topic
 
-SIGNAL_PERIOD = 0.2
-"""Seconds within which a node heeds a signal."""
+_DEADLINE = 3600.0
+"""Seconds after which a wait begins anew."""
 PATIENCE = 2
 """Repeated offers of a tick after which a node answers without what it still waits for."""
 
@@ -169,25 +168,32 @@ def live_qos(depth: int = 64) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 
 
-def spin(executor: Executor, until: Future, received: Sequence[int]) -> None:
+def spin(executor: Executor, until: Future, stop: StopSignal) -> None:
     """Run an executor until a future is done.
 
-    An `EventsExecutor` must be given a deadline: without one it waits until the end of its clock, which overflows,
-    and then polls at full load while its other threads starve. Between two deadlines signals are looked after: a
-    callback that has begun is never cut short.
+    An `EventsExecutor` looks at its deadline only when it has nothing to do, which in a busy graph takes seconds, so
+    a signal completes the future that it waits for: then it returns after the callback that runs. It must be given a
+    deadline all the same: without one it waits until the end of its clock, which overflows, and then polls at full
+    load while its other threads starve.
 
     Args:
         executor: With its nodes.
         until: The future.
-        received: Signals that asked the process to end, from `noted_signals`.
+        stop: Heeds signals.
 
     Raises:
-        KeyboardInterrupt: If the process was asked to end, by SIGINT or SIGTERM.
+        Interrupted: If the process was asked to end.
     """
-    while not until.done():
-        if received:
-            raise KeyboardInterrupt
-        executor.spin_until_future_complete(until, timeout_sec=SIGNAL_PERIOD)
+    ended = Future()
+
+    def end(_: Future | None = None) -> None:
+        ended.set_result(None)
+
+    until.add_done_callback(end)
+    with stop.waking(end):
+        while not (until.done() or stop.requested):
+            executor.spin_until_future_complete(ended, timeout_sec=_DEADLINE)
+    stop.check()
 
 
 def confine_discovery() -> None:
@@ -201,40 +207,26 @@ def init_ros(args: Sequence[str] | None = None) -> None:
     rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)
 
 
-@contextmanager
-def noted_signals() -> Iterator[list[int]]:
-    """Note SIGINT and SIGTERM in a list instead of heeding them; threads but the main one have none to note."""
-    received: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield received
-        return
-    kinds = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(kind, lambda number, _: received.append(number)) for kind in kinds]
-    try:
-        yield received
-    finally:
-        for kind, handler in zip(kinds, before, strict=True):
-            signal.signal(kind, handler)
-
-
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
-    """Run one node in a process of its own until it is interrupted.
+    """Run one node in a process of its own until it is interrupted or the process that started it ends.
 
     Args:
         make: Makes the node; a ValueError or OSError is bad input.
         args: Command line, with ROS arguments; None takes that of the process.
 
     Returns:
-        Exit status: 0, or 2 after one line on stderr about bad input.
+        Exit status: 0, as `ros2 launch` expects it of a node that was interrupted, or 2 after one line on stderr
+        about bad input.
     """
-    init_ros(args)
+    end_with_parent()
     node = None
     try:
-        with noted_signals() as received:
+        with interruptible(), StopSignal() as stop:
+            init_ros(args)
             node = make()
             executor = EventsExecutor()
             executor.add_node(node)
-            spin(executor, Future(), received)
+            spin(executor, Future(), stop)
     except KeyboardInterrupt:
         pass
     except (ValueError, OSError) as error:

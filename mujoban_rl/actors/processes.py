@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
@@ -14,6 +13,7 @@ from typing import Final
 
 import torch
 
+from mujoban_core import children
 from mujoban_rl.actors.actor import ActorError, ActorFactory, Experience, Order, Seat
 from mujoban_rl.actors.pool import ActorDied, ActorPool, Schedule
 
@@ -80,7 +80,8 @@ class ProcessPool(ActorPool):
             target=_serve, args=(theirs, self.factory, stream, self._threads),
             name=f"actor-{actor}", daemon=True,
         )  # fmt: skip
-        process.start()
+        with children.sheltered():
+            process.start()
         theirs.close()
         self._workers[actor] = process, ours
 
@@ -130,8 +131,7 @@ class ProcessPool(ActorPool):
 
 def _serve(pipe: Connection, factory: ActorFactory, stream: int, threads: int) -> None:
     """Carry out orders until the pipe is closed."""
-    # Ctrl-C goes to all processes of a terminal: the learner's alone decides what to do then.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    children.end_with_parent()
     torch.set_num_threads(threads)
     try:
         seat = Seat(factory(stream))

@@ -12,7 +12,7 @@ import imageio.v2 as imageio
 import pytest
 
 from bringup import evaluate, run_stack
-from bringup.command import run_command
+from bringup.command import exit_status
 from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.topics import GRAPH_TOPICS
 from mujoban_sim import rendering
@@ -30,9 +30,7 @@ UNSOLVABLE = """\
 
 
 def run(command, *arguments):
-    with pytest.raises(SystemExit) as exit:
-        run_command("command", partial(command.main, [str(a) for a in arguments]))
-    return exit.value.code
+    return exit_status("command", partial(command.main, [str(a) for a in arguments]))
 
 
 def test_run_stack_plays_records_films_and_reports(tmp_path, capfd):
@@ -130,15 +128,32 @@ def test_without_opengl_the_commands_say_what_to_install(monkeypatch, capfd):
     assert "error: cannot open an OpenGL context: install the Debian packages libegl1" in capfd.readouterr().err
 
 
-def test_an_interrupted_run_leaves_a_whole_bag(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_a_whole_bag(tmp_path, number):
     bag = tmp_path / "bag"
-    command = [sys.executable, "bringup/run_stack.py", "--headless", *ALL_ORACLES, "--record", str(bag)]
+    command = [sys.executable, "bringup/run_stack.py", "--headless", "--episodes", "1000", *ALL_ORACLES]
     root = Path(run_stack.__file__).parents[1]
-    process = subprocess.Popen(command, cwd=root, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*command, "--record", str(bag)], cwd=root, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not (bag / "metadata.yaml").is_file() and time.monotonic() < deadline:
+    while not any(file.stat().st_size > 1e6 for file in bag.glob("*.mcap")) and time.monotonic() < deadline:
         time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and err.strip().endswith("interrupted")
+    assert process.returncode == 128 + number and err.strip().endswith("interrupted")
     assert {m.topic for m in open_bag(bag).messages()} <= set(GRAPH_TOPICS)
+
+
+def test_an_interrupted_recording_leaves_whole_bags_of_all_its_processes(tmp_path):
+    bags = tmp_path / "bags"
+    arguments = ["--out", str(bags), "--processes", "2", "--batch", "2", "--difficulty", "1", *ALL_ORACLES]
+    root = Path(run_stack.__file__).parents[1]
+    process = subprocess.Popen(
+        [sys.executable, "bringup/record.py", *arguments, "--episodes", "100000"], cwd=root, stderr=subprocess.PIPE
+    )
+    deadline = time.monotonic() + 60
+    while len(list(bags.glob("part*_row*/*.mcap"))) < 4 and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.terminate()
+    process.communicate(timeout=60)
+    assert process.returncode == 143
+    assert len([message for bag in bags.iterdir() for message in open_bag(bag).messages()]) > 0

@@ -1,0 +1,81 @@
+"""Processes that end when the one that started them ends, however that happens (Linux)."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import IO, Final
+
+_PARENT: Final = "MUJOBAN_PARENT"
+"""Environment variable that names the process which started this one."""
+_PR_SET_PDEATHSIG: Final = 1
+GRACE: Final = 1.0
+"""Seconds that a process has to end when it is asked to."""
+
+
+def start(
+    command: Sequence[str], environment: Mapping[str, str] | None = None, log: IO[bytes] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start a program that calls `end_with_parent`.
+
+    What the terminal sends, such as Ctrl-C, goes to this process alone, which ends its children in order.
+
+    Args:
+        command: The program and its arguments.
+        environment: Variables on top of this process's environment.
+        log: File that takes what the program prints; None means where this process prints.
+    """
+    variables = {**os.environ, **(environment or {}), _PARENT: str(os.getpid())}
+    return subprocess.Popen(command, env=variables, process_group=0, stdout=log, stderr=log)
+
+
+@contextmanager
+def sheltered() -> Iterator[None]:
+    """Keep the terminal's Ctrl-C from the processes of `multiprocessing` that are started within.
+
+    They inherit that the signal is blocked; this process receives it when the context ends.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_with_parent() -> None:
+    """Have this process asked to end, by SIGTERM, when its parent ends, even when that is killed.
+
+    The parent is the process that has used `start` or `multiprocessing`; without one nothing happens.
+
+    Raises:
+        SystemExit: If the parent has ended already.
+    """
+    parent = multiprocessing.parent_process()
+    pid = os.environ.pop(_PARENT, None) if parent is None else parent.pid
+    if pid is None:
+        return
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != int(pid):
+        raise SystemExit(128 + signal.SIGTERM)
+
+
+def stop(children: Iterable[subprocess.Popen[bytes]], grace: float = GRACE) -> int:
+    """Ask programs to end, and kill those that have not after `grace` seconds; return how many those were."""
+    running = list(children)
+    for child in running:
+        child.terminate()
+    deadline, killed = time.monotonic() + grace, 0
+    for child in running:
+        try:
+            child.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+            killed += 1
+    return killed

@@ -1,0 +1,177 @@
+"""Signals that ask a program to end: the one place where they are handled, for commands, nodes and trainers.
+
+Work that must be finished in order, such as a bag that is being written, runs within a `StopSignal`, which notes a
+signal and lets the work end itself. All other code of a program is cut short by an `Interrupted`.
+"""
+
+from __future__ import annotations
+
+import atexit
+import errno
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType, TracebackType
+from typing import Any, Final, NoReturn, Self
+
+STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, a polite kill, a terminal that was closed."""
+AGAIN: Final = 0.5
+"""Seconds after the first signal from which on another SIGINT is a second one; runners that pass on what the terminal
+has sent already, such as make, deliver one twice."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal asked the process to end."""
+
+    def __init__(self, number: int) -> None:
+        """Name the signal."""
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+    @property
+    def status(self) -> int:
+        """Exit status that shells give to a program that a signal has ended: 130 for SIGINT, 143 for SIGTERM."""
+        return 128 + self.number
+
+
+def interrupt_status(error: KeyboardInterrupt) -> int:
+    """Return the exit status of a program that was interrupted."""
+    return error.status if isinstance(error, Interrupted) else 128 + signal.SIGINT
+
+
+def interruption(error: BaseException) -> KeyboardInterrupt | None:
+    """Return the interruption after which writing to the terminal failed, since it was closed, if `error` is that."""
+    earlier = error.__context__
+    while isinstance(error, OSError) and error.errno == errno.EIO and earlier is not None:
+        if isinstance(earlier, KeyboardInterrupt):
+            return earlier
+        earlier = earlier.__context__
+    return None
+
+
+def leave(status: int) -> NoReturn:
+    """End the process once what was registered with `atexit` has run.
+
+    The interpreter is not taken down in order: with PyTorch and ROS in it that takes seconds on a busy machine.
+    """
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # a terminal that was closed, a pipe whose reader has left
+            stream.flush()
+    os._exit(status)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise `Interrupted` in the main thread where a signal asks the process to end."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        raise Interrupted(number)
+
+    before = _handle(interrupt)
+    try:
+        yield
+    finally:
+        _put_back(before)
+
+
+class StopSignal:
+    """Context in which a signal asks the work to end instead of cutting it short.
+
+    A second SIGINT cuts it short all the same, by `Interrupted`. Once that has been raised, further signals change
+    nothing, so that what was begun is put away in order. In threads but the main one nothing is handled.
+
+    Attributes:
+        number: The first signal that came, or None.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self._at = 0.0
+        self._raised = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    @property
+    def requested(self) -> bool:
+        """Whether a signal came."""
+        return self.number is not None
+
+    def check(self) -> None:
+        """Raise `Interrupted` if a signal came."""
+        if self.number is not None:
+            self._raised = True
+            raise Interrupted(self.number)
+
+    @contextmanager
+    def waking(self, wake: Callable[[], None]) -> Iterator[None]:
+        """Call `wake` as soon as a signal comes, from another thread: for work that waits outside of Python.
+
+        Python runs a signal's handler between two of its own instructions, of which there may be none for long. The
+        C library's handler writes into a pipe at once.
+        """
+        if not self._before:  # not in the main thread: no signal arrives here
+            yield
+            return
+        ours, theirs = os.pipe()
+        os.set_blocking(theirs, False)
+        watcher = threading.Thread(target=self._watch, args=(ours, wake), name="signals", daemon=True)
+        watcher.start()
+        before = signal.set_wakeup_fd(theirs, warn_on_full_buffer=False)
+        try:
+            if self.requested:
+                wake()
+            yield
+        finally:
+            signal.set_wakeup_fd(before)
+            os.close(theirs)
+            watcher.join()
+            os.close(ours)
+
+    def _watch(self, pipe: int, wake: Callable[[], None]) -> None:
+        while numbers := os.read(pipe, 64):
+            for number in set(numbers).intersection(self._before):
+                self._note(number)
+                wake()
+
+    def _note(self, number: int) -> None:
+        if self.number is None:
+            self.number, self._at = number, time.monotonic()
+
+    def _handler(self, number: int, frame: FrameType | None) -> None:
+        again = self.requested and number == signal.SIGINT and time.monotonic() - self._at > AGAIN
+        self._note(number)
+        if again and not self._raised:
+            self._raised = True
+            raise Interrupted(number)
+
+    def __enter__(self) -> Self:
+        """Handle signals."""
+        self._before = _handle(self._handler)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Put the former handlers back; writing to a terminal that was closed failed for the signal's sake."""
+        _put_back(self._before)
+        self._before = {}
+        if self.number is not None and isinstance(value, OSError) and value.errno == errno.EIO:
+            raise Interrupted(self.number) from value
+
+
+def _handle(handler: Callable[[int, FrameType | None], None]) -> dict[signal.Signals, Any]:
+    """Install a handler and return those before it; a SIGHUP that is ignored, as under nohup, stays so."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    handled = [s for s in STOP_SIGNALS if s != signal.SIGHUP or signal.getsignal(s) != signal.SIG_IGN]
+    return {number: signal.signal(number, handler) for number in handled}
+
+
+def _put_back(handlers: dict[signal.Signals, Any]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)

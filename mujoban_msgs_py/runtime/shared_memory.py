@@ -1,0 +1,76 @@
+"""Shared memory that Fast DDS has left behind where a process was killed."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+FOLDER: Final = Path("/dev/shm")
+_SEGMENT: Final = re.compile(r"(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?")
+
+
+def clear_shared_memory(folder: Path = FOLDER) -> list[str]:
+    """Remove this user's segments and ports of Fast DDS that no process holds; return the names of the files.
+
+    A segment in use is held by a lock on the file beside it, which Fast DDS itself goes by (`fastdds shm clean`). It
+    may be without that file for a moment; so what any process has open or has mapped is left alone as well.
+    """
+    groups: dict[str, list[Path]] = {}
+    for file in sorted(folder.glob("*fastrtps_*")):
+        match = _SEGMENT.fullmatch(file.name)
+        if match is not None and _is_own(file):
+            groups.setdefault(match[1], []).append(file)
+    # The look at the processes comes after that at the files: whoever has just made one has it open or mapped by now.
+    used = _used_names() if groups else set()
+    removed = []
+    for files in groups.values():
+        if used.isdisjoint(file.name for file in files) and not any(map(_is_locked, files)):
+            for file in files:
+                file.unlink(missing_ok=True)
+                removed.append(file.name)
+    return removed
+
+
+def _is_own(file: Path) -> bool:
+    try:
+        return file.lstat().st_uid == os.getuid()
+    except OSError:  # gone by now
+        return False
+
+
+def _is_locked(file: Path) -> bool:
+    if not file.name.endswith(("_el", "_sl")):
+        return False
+    try:
+        with file.open("rb") as opened:
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
+def _used_names() -> set[str]:
+    """Return the names of the files in shared memory that any process of this user has open, then those mapped."""
+    names: set[str] = set()
+    processes = [entry for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
+    for process in processes:
+        try:
+            links = list((process / "fd").iterdir())
+        except OSError:  # another user's, or ended
+            continue
+        for link in links:
+            with suppress(OSError):  # closed by now
+                names.add(os.readlink(link).rpartition("/")[2])
+    for process in processes:
+        try:
+            maps = (process / "maps").read_text(errors="replace")
+        except OSError:
+            continue
+        names.update(line.rpartition("/")[2] for line in maps.splitlines() if "fastrtps_" in line)
+    return names

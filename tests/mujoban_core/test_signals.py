@@ -1,0 +1,95 @@
+"""Signals: noted where work must end in order, raised elsewhere; processes that end with their parent."""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from mujoban_core.signals import STOP_SIGNALS, Interrupted, StopSignal, interruptible
+
+
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_a_signal_asks_the_work_to_end_and_names_the_exit_status(number):
+    before = signal.getsignal(number)
+    with StopSignal() as stop:
+        os.kill(os.getpid(), number)
+        assert stop.requested
+        with pytest.raises(Interrupted) as raised:
+            stop.check()
+    assert raised.value.status == 128 + number and signal.getsignal(number) is before
+
+
+def test_a_second_ctrl_c_cuts_the_work_short_but_not_what_puts_it_away(monkeypatch):
+    monkeypatch.setattr("mujoban_core.signals.AGAIN", 0.0)
+    with StopSignal():
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(Interrupted):
+            os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_ctrl_c_that_is_delivered_twice_counts_once():
+    with StopSignal() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.requested
+
+
+def test_work_that_waits_outside_of_python_is_woken():
+    woken = threading.Event()
+    with StopSignal() as stop, stop.waking(woken.set):
+        signal.raise_signal(signal.SIGTERM)
+        assert woken.wait(10) and stop.number == signal.SIGTERM
+
+
+def test_outside_of_such_work_a_signal_interrupts():
+    with interruptible(), pytest.raises(Interrupted) as raised:
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert raised.value.number == signal.SIGTERM
+
+
+def test_a_hang_up_that_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with StopSignal() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop.requested
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+CHILD = "import os; from mujoban_core.children import end_with_parent; end_with_parent(); os.write(1, b'up'); input()"
+STARTED = f"""
+import subprocess, sys, time
+from mujoban_core import children
+children.start([sys.executable, "-c", {CHILD!r}])
+time.sleep(100)
+"""
+WORKER = """
+import multiprocessing, os, time
+from mujoban_core import children
+def work():
+    children.end_with_parent()
+    os.write(1, b"up")
+    time.sleep(100)
+with children.sheltered():
+    multiprocessing.get_context("fork").Process(target=work).start()
+time.sleep(100)
+"""
+
+
+@pytest.mark.parametrize("program", [STARTED, WORKER])
+def test_a_child_ends_when_its_parent_is_killed(program):
+    reading, writing = os.pipe()
+    parent = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=writing)
+    os.close(writing)
+    assert os.read(reading, 2) == b"up"
+    parent.kill()
+    parent.wait()
+    # The pipe ends when the last process that could write to it has ended.
+    assert select.select([reading], [], [], 20)[0] and os.read(reading, 1) == b""
+    os.close(reading)
