@@ -166,6 +166,18 @@ class TerminationOutput(NamedTuple):
     """Where beta_t was forced because the instruction had its `limit` ticks, [B]."""
 
 
+def check_termination(*, limit: int, threshold: float) -> None:
+    """Refuse settings with which a `Termination` would never or always say that an instruction is completed.
+
+    Raises:
+        ValueError: If one is out of its range.
+    """
+    if limit < 1:
+        raise ValueError(f"limit is {limit}: expected a number of ticks from 1 on")
+    if not 0.0 < threshold < 1.0:
+        raise ValueError(f"threshold is {threshold}: expected a probability between 0 and 1")
+
+
 class Termination(Module):
     """Decide whether the controller has completed the instruction (paper C.4).
 
@@ -174,8 +186,13 @@ class Termination(Module):
     """
 
     def __init__(self, *, limit: int = INSTRUCTION_LIMIT, sample: bool = False, threshold: float = 0.5) -> None:
-        """Sample beta ~ p as in the paper if `sample`, else beta = (p > threshold)."""
+        """Sample beta ~ p as in the paper if `sample`, else beta = (p > threshold).
+
+        Raises:
+            ValueError: If a setting is out of its range.
+        """
         super().__init__()
+        check_termination(limit=limit, threshold=threshold)
         self.limit = limit
         self.sample = sample
         self.threshold = threshold

@@ -13,16 +13,21 @@ from mujoban_msgs.msg import Episode
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
-from mujoban_core.interfaces import NO_INSTRUCTION, GroundTruth, TerminationInput
+from mujoban_core.interfaces import NO_INSTRUCTION, GroundTruth, TerminationInput, check_termination
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
-from mujoban_msgs_py.runtime.module_node import ModuleNode
+from mujoban_msgs_py.runtime.descriptors import described
+from mujoban_msgs_py.runtime.module_node import MOST_TICKS, ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 
 REMEMBERED = 64
 """Instructions kept while it is not known which tick they precede: those of other ticks may come in between."""
-_SETTINGS = ("sample", "threshold", "limit")
+_SETTINGS = {
+    "sample": described("whether beta is drawn from its probability, as in the paper"),
+    "threshold": described("probability above which beta is true where it is not drawn", low=0.0, high=1.0),
+    "limit": described("ticks after which beta is forced", low=1, high=MOST_TICKS),
+}
 
 
 class TerminationNode(ModuleNode):
@@ -46,8 +51,9 @@ class TerminationNode(ModuleNode):
         self._publisher = self.create_output(topics.TERMINATION)
         self._terminated = False
         self._said: dict[int, conversions.InstructionReading] = {}
-        for name in _SETTINGS:
-            setattr(self.module, name, self.declare_parameter(name, getattr(self.module, name)).value)
+        for name, descriptor in _SETTINGS.items():
+            setattr(self.module, name, self.declare_parameter(name, getattr(self.module, name), descriptor).value)
+        check_termination(limit=self.module.limit, threshold=self.module.threshold)
         listen(self, topics.INSTRUCTION, self._on_instruction)
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
@@ -100,14 +106,16 @@ class TerminationNode(ModuleNode):
         self.retry()
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        settings: dict[str, Any] = {name: getattr(self.module, name) for name in _SETTINGS}
+        settings |= {p.name: p.value for p in parameters if p.name in _SETTINGS}
+        try:
+            check_termination(limit=settings["limit"], threshold=settings["threshold"])
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         result = super()._on_parameters(parameters)
         if result.successful:
-            for name in _SETTINGS:
-                if self.has_parameter(name):
-                    setattr(self.module, name, self.get_parameter(name).value)
-            for parameter in parameters:
-                if parameter.name in _SETTINGS:
-                    setattr(self.module, parameter.name, parameter.value)
+            for name, value in settings.items():
+                setattr(self.module, name, value)
         return result
 
 

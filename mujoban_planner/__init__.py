@@ -39,7 +39,10 @@ def load(
     planner = load_weights(ARCHITECTURES[name], weights, device)
     planner.lay_out()
     if compiled and next(planner.parameters()).device.type == "cpu":
-        planner.compiled = CompiledDecision.beside(weights, record["digest"])
+        graph = CompiledDecision.beside(weights, record)
+        if graph is not None:
+            graph.check(planner.weigh)
+        planner.compiled = graph
     return planner
 
 

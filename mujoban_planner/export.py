@@ -6,6 +6,7 @@ run it too: it holds the weights, takes `compiled.INPUTS` and returns `compiled.
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 from collections.abc import Iterable
@@ -24,7 +25,7 @@ from mujoban_planner import SHIPPED, load
 from mujoban_planner.compiled import DIGEST, INPUTS, OUTPUTS, graph_path
 from mujoban_planner.heads import INSTRUCTIONS, INTERIOR, Weighed
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_rl.weights import WeightsError, digest
+from mujoban_rl.weights import WeightsError, digest, read_record, record_path
 
 
 @dataclass(frozen=True)
@@ -68,9 +69,10 @@ def export(weights: Path) -> Path:
     model = program.model
     _strip(model.graph.all_nodes())
     _strip([model, model.graph, *model.graph.inputs, *model.graph.outputs, *model.graph.initializers.values()])
-    model.metadata_props[DIGEST] = digest(weights)
     path = graph_path(weights)
     write_atomically(path, program.model_proto.SerializeToString())
+    record = read_record(weights) | {DIGEST: digest(path)}
+    write_atomically(record_path(weights), (json.dumps(record, indent=2) + "\n").encode())
     return path
 
 

@@ -7,7 +7,8 @@ import hashlib
 import json
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,10 +17,19 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as dump_tensors
 from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from mujoban_core.files import write_atomically
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+
+WEIGHTS_LIMIT = 1 << 30
+"""Bytes of a file of weights or of a graph at most; the largest here has some 10 MB."""
+RECORD_LIMIT = 1 << 24
+"""Bytes of a record at most."""
+SIZE_LIMIT = 1 << 16
+"""Largest number in a configuration: beyond it no module of ours can be meant, and none is built."""
 
 
 class WeightsError(ValueError):
@@ -93,15 +103,56 @@ def read_record(path: str | Path) -> dict[str, Any]:
         WeightsError: If it is missing or is not a record.
     """
     file = record_path(path)
+    if not file.is_file():
+        raise WeightsError(f"{file}: no record beside the weights; expected a JSON file")
     try:
-        content = json.loads(file.read_text())
-    except FileNotFoundError:
-        raise WeightsError(f"{file}: no record beside the weights; expected a JSON file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        content = json.loads(read_bounded(file, RECORD_LIMIT))
+    except (ValueError, RecursionError) as error:
         raise WeightsError(f"{file}: not a JSON record: {error}") from None
     if not isinstance(content, dict) or not {"class", "config", "digest"} <= content.keys():
         raise WeightsError(f"{file}: expected a JSON object with keys class, config and digest")
+    for key, kind in (("class", str), ("config", dict), ("digest", str), ("graph", str)):
+        if key in content and not isinstance(content[key], kind):
+            raise WeightsError(f"{file}: {key} is {str(content[key])[:40]!r}, expected a {kind.__name__}")
+    for name, value in content["config"].items():
+        for item in value if isinstance(value, list) else [value]:
+            if not isinstance(item, str | int | float) or (not isinstance(item, str) and not abs(item) <= SIZE_LIMIT):
+                raise WeightsError(
+                    f"{file}: {name} is {str(value)[:40]} in its configuration, expected texts and numbers up to "
+                    f"{SIZE_LIMIT}"
+                )
     return content
+
+
+def read_bounded(path: Path, limit: int) -> bytes:
+    """Return the content of a regular file of at most `limit` bytes.
+
+    Raises:
+        WeightsError: If it is none, or longer.
+        OSError: If it cannot be read.
+    """
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such file")
+    if (size := path.stat().st_size) > limit:
+        raise WeightsError(f"{path}: has {size} bytes, expected at most {limit}")
+    return path.read_bytes()
+
+
+def usable_device(device: str | torch.device) -> torch.device:
+    """Return a device that modules can be put on.
+
+    Raises:
+        WeightsError: If there is no such device on this machine.
+    """
+    try:
+        chosen = torch.device(device)
+    except RuntimeError:
+        raise WeightsError(f"device {str(device)!r}: expected cpu or cuda, such as cuda:0") from None
+    if chosen.type not in ("cpu", "cuda"):
+        raise WeightsError(f"device {str(device)!r}: expected cpu or cuda, such as cuda:0")
+    if chosen.type == "cuda" and (chosen.index or 0) >= (found := torch.cuda.device_count()):
+        raise WeightsError(f"device {str(device)!r}: this machine has {found} CUDA devices that torch can use")
+    return chosen
 
 
 def load_weights(cls: type[ModuleT], path: str | Path, device: str | torch.device = "cpu") -> ModuleT:
@@ -115,27 +166,55 @@ def load_weights(cls: type[ModuleT], path: str | Path, device: str | torch.devic
     Raises:
         WeightsError: If a file is missing or damaged (digest), or class, configuration or shapes do not fit.
     """
-    path = Path(path)
+    path, chosen = Path(path), usable_device(device)
     if not path.is_file():
         raise WeightsError(f"{path}: no such weights file; expected .safetensors written by a train command")
     record = read_record(path)
-    data = path.read_bytes()
+    data = read_bounded(path, WEIGHTS_LIMIT)
     if (found := hashlib.sha256(data).hexdigest()) != record["digest"]:
         raise WeightsError(f"{path}: damaged or not the file of its record: SHA-256 is {found}, not {record['digest']}")
     if record["class"] != cls.__name__:
         raise WeightsError(f"{path}: holds weights of {record['class']}, expected {cls.__name__}")
     try:
-        module = cls(**record["config"])
-    except (TypeError, ValueError) as error:
-        raise WeightsError(f"{path}: configuration does not fit {cls.__name__}: {error}") from None
-    try:
         tensors = load_tensors(data)
-    except SafetensorError as error:
+    except (SafetensorError, ValueError, KeyError) as error:
         raise WeightsError(f"{path}: not a safetensors file: {error}") from None
-    _check_shapes(tensors, module.state_dict(), path)
+    # Without memory at first: what the configuration asks for must be what the file holds.
+    with torch.device("meta"), _at_most(len(tensors)):
+        _check_shapes(tensors, _build(cls, record["config"], path).state_dict(), path)
     check_finite(tensors, str(path))
+    module = _build(cls, record["config"], path)
     module.load_state_dict(tensors)
-    return module.to(device).eval()
+    return module.to(chosen).eval()
+
+
+@contextmanager
+def _at_most(count: int) -> Iterator[None]:
+    """Stop the building of modules with more than `count` parameters in all, which may take for ever."""
+    built = 0
+
+    def count_one(*_: object) -> None:
+        nonlocal built
+        built += 1
+        if built > count:
+            raise ValueError(f"it asks for more than the {count} tensors of the file")
+
+    handle = register_module_parameter_registration_hook(count_one)
+    try:
+        yield
+    finally:
+        handle.remove()
+
+
+def _build(cls: type[ModuleT], config: Mapping[str, Any], path: Path) -> ModuleT:
+    """Return a module of a configuration from a record."""
+    try:
+        return cls(**config)
+    except WeightsError:
+        raise
+    except Exception as error:  # whatever a module makes of numbers that it was never meant for
+        reason = " ".join(str(error).split()).partition(" Exception raised from")[0]
+        raise WeightsError(f"{path}: configuration does not fit {cls.__name__}: {reason}") from None
 
 
 def check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
@@ -153,3 +232,5 @@ def _check_shapes(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor],
         if tensor.shape != tensors[name].shape:
             got, want = tuple(tensors[name].shape), tuple(tensor.shape)
             raise WeightsError(f"{path}: {name} has shape {got}, expected {want}")
+        if tensor.is_floating_point() != tensors[name].is_floating_point():
+            raise WeightsError(f"{path}: {name} is of type {tensors[name].dtype}, expected {tensor.dtype}")

@@ -9,15 +9,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 from mujoban_msgs.msg import Episode
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
 from mujoban_core.interfaces import GroundTruth
 from mujoban_core.look_around import LOOKING_ROLES, look_around
 from mujoban_core.plugins import LEARNED, load_module
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.runtime.descriptors import described
 from mujoban_msgs_py.runtime.tick_node import Input, Output, TickNode
 
+MOST_TICKS = 1_000_000
+"""Upper end of ranges of ticks, which have none of their own."""
 TRUTH_INPUTS = (
     Input(topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_from_msg),
     Input(topics.TRUE_POSE, conversions.pose_from_msg),
@@ -52,13 +55,15 @@ class ModuleNode(TickNode):
             ValueError: If the module or its weights cannot be loaded.
         """
         super().__init__(self.role, **options)
-        source: Any = self.declare_parameter("module", LEARNED, ParameterDescriptor(read_only=True)).value
+        which = described("learned, oracle or package.module:Class", fixed=True)
+        source: Any = self.declare_parameter("module", LEARNED, which).value
         self._source: str = source
-        weights: Any = self.declare_parameter("weights", "").value
-        device: Any = self.declare_parameter("device", "cpu").value
+        weights: Any = self.declare_parameter("weights", "", described("weights file; empty: those that ship")).value
+        device: Any = self.declare_parameter("device", "cpu", described("cpu or cuda, such as cuda:0")).value
         self._look_around = 0
         if self.role in LOOKING_ROLES:
-            ticks: Any = self.declare_parameter("look_around", 0, ParameterDescriptor(read_only=True)).value
+            look = described("ticks of a look, a turn on the spot; 0: none", fixed=True, low=0, high=MOST_TICKS)
+            ticks: Any = self.declare_parameter("look_around", 0, look).value
             self._look_around = ticks
         self.module: Any = self._load(weights, device)
         self.state: Any = None

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import rclpy
 from mujoban_msgs.msg import Episode
+from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -229,7 +230,7 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
             spin(executor, Future(), stop)
     except KeyboardInterrupt:
         pass
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ParameterException) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     finally:

@@ -1,5 +1,6 @@
 """What the graph bears: nodes that die, services, bad input, a clock that does not wait, weights that change."""
 
+import re
 import signal
 import time
 
@@ -191,6 +192,27 @@ def test_weights_are_loaded_while_the_graph_runs_and_bad_ones_are_refused(play_g
     assert estimator.module is not module
     ticks = graph.simulator.ticks
     graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
+
+
+@pytest.mark.parametrize(
+    ("node", "name", "value", "reason"),
+    [
+        ("estimator", "device", "cuda:7", "device 'cuda:7': this machine has"),
+        ("estimator", "device", "meta", "device 'meta': expected cpu or cuda"),
+        ("termination", "threshold", float("nan"), "threshold is nan|range"),
+        ("termination", "threshold", 1.5, "range"),
+        ("termination", "limit", -3, "limit is -3: expected a number of ticks|range"),
+    ],
+)
+def test_a_setting_out_of_its_range_is_refused_with_the_reason(
+    play_graph, oracles, fresh_weights, node, name, value, reason
+):
+    graph = play_graph(Stack(oracles.choices | {"estimator": fresh_weights.choices["estimator"]}), names=[node])
+    before = graph.graph.nodes[node].get_parameter(name).value
+    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+    result = graph.call(SetParameters, f"/{node}/set_parameters", request).results[0]
+    assert not result.successful and re.search(reason, result.reason), result.reason
+    assert graph.graph.nodes[node].get_parameter(name).value == before
 
 
 def test_missing_weights_stop_a_node_with_a_clear_error(play_graph, oracles, tmp_path):

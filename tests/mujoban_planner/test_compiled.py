@@ -1,4 +1,6 @@
 import copy
+import json
+import os
 import shutil
 
 import numpy as np
@@ -12,7 +14,7 @@ from mujoban_planner.decision import count_visits, initial_thoughts, initial_vis
 from mujoban_planner.export import export, main
 from mujoban_planner.networks import RecurrentPlanner
 from mujoban_planner.play import play
-from mujoban_rl.weights import WeightsError, save_weights
+from mujoban_rl.weights import WeightsError, digest, save_weights
 from mujoban_sokoban.generator import generate_batch
 
 LEVELS = generate_batch(5, range(1000, 1004))
@@ -110,7 +112,7 @@ def test_a_copy_has_the_graph_as_well(small):
 
 def test_what_is_no_graph_of_a_decision_is_named(small):
     graph_path(small).write_bytes(b"no graph")
-    with pytest.raises(WeightsError, match=r"small\.onnx: no graph .*mujoban_planner\.export"):
+    with pytest.raises(WeightsError, match=r"small\.onnx: damaged .*mujoban_planner\.export"):
         mujoban_planner.load(small)
 
 
@@ -126,3 +128,31 @@ def test_export_of_missing_weights_is_one_line(tmp_path, monkeypatch, capsys):
     assert main() == 2
     error = capsys.readouterr().err
     assert error.startswith("export: error: ") and "none" in error and error.count("\n") == 1
+
+
+def test_no_flipped_bit_of_a_graph_is_decided_with(small):
+    rng, whole = np.random.default_rng(0), graph_path(small).read_bytes()
+    for _ in range(50):
+        data = bytearray(whole)
+        data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        graph_path(small).write_bytes(data)
+        with pytest.raises(WeightsError, match=r"small\.onnx: damaged or not the graph of its record"):
+            mujoban_planner.load(small)
+
+
+def test_a_graph_that_says_something_else_than_the_weights_is_refused(small):
+    other = mujoban_planner.load(small, compiled=False)
+    with torch.no_grad():
+        for weight in other.parameters():
+            weight.neg_()
+    save_weights(small, other, other.config, {})
+    record = json.loads(small.with_suffix(".json").read_text())
+    small.with_suffix(".json").write_text(json.dumps(record | {"graph": digest(graph_path(small))}))
+    with pytest.raises(WeightsError, match=r"small\.onnx: its \w+ is not that of the weights"):
+        mujoban_planner.load(small)
+
+
+def test_onnx_runtime_sends_nothing_home(small, monkeypatch):
+    monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
+    mujoban_planner.load(small)
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"
