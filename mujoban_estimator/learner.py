@@ -145,12 +145,12 @@ class EstimatorLearner(Learner[Batch]):
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> dict[str, float]:
         """Take one gradient step; return the parts of the loss."""
+        self._schedule.follow(progress)
         memory = self._belief, self._track
         loss, parts = self.loss(batch)
         if guarded_step(loss, [self.optimiser], guard, clip=self.training.clip) is None:
             # What a refused batch left in memory would spoil those to come.
             self._belief, self._track = memory
-        self._schedule.follow(progress)
         return {f"train/{name}": float(value) for name, value in parts.items()}
 
     def state(self) -> State:

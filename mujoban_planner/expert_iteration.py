@@ -108,12 +108,12 @@ class ExpertLearner(Learner[Batch]):
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take a gradient step."""
+        self._schedule.follow(progress)
         shown = hide_unseen(blur(batch.state, self.config.noise, self._generator), self.config.hidden, self._rng)
         with torch.autocast("cpu", torch.bfloat16):
             loss, parts = imitation_loss(self.network, batch._replace(state=shown), self._loss)
         if guarded_step(loss, [self._adam], guard, clip=1.0) is not None:
             self._average.update_parameters(self.network)
-        self._schedule.follow(progress)
         return {f"train/{k}": float(v) for k, v in parts.items()}
 
     def weights(self) -> Mapping[str, Tensor]:

@@ -133,12 +133,12 @@ class ImitationLearner(Learner[Batch]):
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> dict[str, float]:
         """Take one gradient step; return the parts of the loss."""
+        self._schedule.follow(progress)
         with torch.autocast(self.device.type, torch.bfloat16):
             loss, parts = imitation_loss(self.network, batch.to(self.device), self.config)
         if guarded_step(loss, [self.optimiser], guard, clip=_CLIP) is not None:
             self._average.update_parameters(self.network)
         rate = self.optimiser.param_groups[0]["lr"]
-        self._schedule.follow(progress)
         return {f"train/{name}": float(value) for name, value in parts.items()} | {"learning_rate": rate}
 
     def weights(self) -> Mapping[str, Tensor]:

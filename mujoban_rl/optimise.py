@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 
 from torch import Tensor, nn
@@ -62,9 +63,12 @@ class ProgressSchedule:
         self._scheduler = LambdaLR(optimiser, lambda _: factor(self._progress))
 
     def follow(self, progress: float) -> None:
-        """Set the rates for the next step; call it after a step, with the share in [0, 1] that is spent."""
+        """Set the rates for the step to come; call it before a step, with the share in [0, 1] that is spent."""
         self._progress = min(max(progress, 0.0), 1.0)
-        self._scheduler.step()
+        with warnings.catch_warnings():
+            # Schedulers that count are called after a step; this one does not count.
+            warnings.filterwarnings("ignore", "Detected call of `lr_scheduler.step")
+            self._scheduler.step()
 
 
 def warm_up_cosine(warm_up: float) -> Callable[[float], float]:

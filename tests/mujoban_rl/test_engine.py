@@ -44,11 +44,11 @@ class Regression(Learner[torch.Tensor]):
         self.generator.set_state(state.tensors["generator"])
 
     def update(self, batch, progress, guard):
+        self.schedule.follow(progress)
         kept = torch.rand(batch[:, 1:].shape, generator=self.generator) < 0.9
         loss = (self.duals(self.net(batch[:, 1:] * kept)) - batch[:, :1]).square().mean()
         if guarded_step(loss, [self.adam, self.dual_adam], guard, clip=1.0) is not None:
             self.average.update_parameters(self.net)
-        self.schedule.follow(progress)
         return {"loss": loss.item()}
 
     def evaluate(self):
