@@ -38,9 +38,9 @@ from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, Weighed, 
 from mujoban_planner.propagation import PLANES, propagate
 
 CAUTION = 4.0
-"""Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/planner.md)."""
+"""Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/research)."""
 DOUBT = 0.02
-"""Probability that a push is deadly from which on the planner looks again before it, by default (docs/planner.md)."""
+"""Probability that a push is deadly from which on the planner looks again before it, by default (docs/research)."""
 
 
 class LearnedPlanner(nn.Module, Planner):

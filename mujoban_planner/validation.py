@@ -8,7 +8,7 @@ from typing import Final, Literal
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
-from mujoban_sokoban.generator import TEST_SEEDS, generate_batch
+from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_batch
 from mujoban_sokoban.levels import LevelBatch
 
 _FIRST_SEED: Final = 9_000_000
@@ -60,7 +60,7 @@ class NetworkConfig:
 def validation_levels(difficulty: int, n: int) -> LevelBatch:
     """Return `n` held-out levels."""
     seeds = range(_FIRST_SEED, _FIRST_SEED + n)
-    assert seeds[0] in TEST_SEEDS and seeds[-1] in TEST_SEEDS
+    assert seeds[0] in VALIDATION_SEEDS and seeds[-1] in VALIDATION_SEEDS
     return generate_batch(difficulty, seeds)
 
 
