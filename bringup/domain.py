@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
+import errno
 import os
+import socket
 import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import IO
 
 DOMAINS = range(102)
 """Domains that Linux's ephemeral ports do not reach into."""
@@ -20,11 +18,24 @@ def claim_domain() -> Iterator[int]:
     """Hold a ROS domain while a graph runs, and name it in the environment.
 
     `ROS_DOMAIN_ID` decides where it is set. Otherwise the first domain is taken that no other graph of this
-    machine holds.
+    machine holds, whoever runs it.
+
+    Raises:
+        ValueError: If `ROS_DOMAIN_ID` is no number.
+        OSError: If another graph runs in that domain, or in all of them.
     """
     chosen = os.environ.get("ROS_DOMAIN_ID")
     if chosen:
-        yield int(chosen)
+        if not chosen.isdecimal():
+            raise ValueError(f"ROS_DOMAIN_ID is {chosen!r}: expected a number from 0 on")
+        lock = _lock(int(chosen))
+        if lock is None:
+            raise OSError(
+                f"another graph runs in ROS domain {chosen} on this machine, and the two would mix: "
+                "expected another ROS_DOMAIN_ID, or none"
+            )
+        with lock:
+            yield int(chosen)
         return
     for domain in DOMAINS:
         lock = _lock(domain)
@@ -34,21 +45,26 @@ def claim_domain() -> Iterator[int]:
             print(f"another graph runs on this machine: using ROS_DOMAIN_ID={domain}", file=sys.stderr)
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         try:
-            yield domain
+            with lock:
+                yield domain
         finally:
             del os.environ["ROS_DOMAIN_ID"]
-            lock.close()
         return
     raise OSError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are taken by graphs of this machine")
 
 
-def _lock(domain: int) -> IO[str] | None:
-    """Return an open, locked file, or None if another process holds it."""
-    path = Path(tempfile.gettempdir()) / f"mujoban-ros-domain-{domain}-{os.getuid()}.lock"
-    file = path.open("w")
+def _lock(domain: int) -> socket.socket | None:
+    """Return what holds a domain until it is closed, or None if another process holds it.
+
+    It is a socket's name in Linux's abstract namespace: one for all users of a machine, in no folder, and free as soon
+    as the process that holds it has ended.
+    """
+    holder = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
-        return None
-    return file
+        holder.bind(f"\0mujoban-ros-domain-{domain}")
+    except OSError as error:
+        holder.close()
+        if error.errno == errno.EADDRINUSE:
+            return None
+        raise
+    return holder
