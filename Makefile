@@ -1,7 +1,6 @@
 # make setup  .venv with everything in it          make lint   ruff, pyright and import rules
 # make run    one episode with a live view         make bench  measurements, as JSON
-# make results  the tables and figures of the paper, the model cards
-# make docs   the API reference, in build/docs
+# make results  the tables and figures of the paper
 # make test   the test suite
 #
 # PYTHON chooses the interpreter for .venv; ARGS are passed on, as in: make run ARGS="--difficulty 1"
@@ -11,10 +10,8 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 INPUTS := pyproject.toml setup.py mujoban_msgs_py/interface_build.py $(wildcard mujoban_msgs_py/msg/*.msg)
 ARGS ?=
-PACKAGES := mujoban_core mujoban_sokoban mujoban_msgs_py mujoban_sim mujoban_rl mujoban_estimator mujoban_planner \
-  mujoban_controller bringup
 
-.PHONY: setup run test lint bench results docs clean
+.PHONY: setup run test lint bench results clean
 
 setup: $(STAMP)
 
@@ -37,10 +34,6 @@ lint: $(STAMP)
 
 results: $(STAMP)
 	$(BIN)/python -m benchmarks.paper
-	$(BIN)/python -m benchmarks.model_cards
-
-docs: $(STAMP)
-	MUJOCO_GL=egl PYTHONWARNINGS=ignore $(BIN)/pdoc --docformat google --no-show-source --output-directory build/docs $(PACKAGES)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks $(ARGS)

@@ -118,6 +118,9 @@ class Stack:
     look_around: int | None = None
     """Ticks of looking around at the start of an episode; None: `LOOK_AROUND_TICKS`, or 0 for the oracle estimator."""
 
+    threads: int = 1
+    """Threads of the networks in each process."""
+
     @property
     def look_around_ticks(self) -> int:
         """Ticks of looking around at the start of an episode."""
@@ -150,13 +153,13 @@ def positive(text: str) -> int:
     return number
 
 
-def add_episode_options(parser: argparse.ArgumentParser, *, episodes: int | None = None, seed: int = 0) -> None:
+def add_episode_options(parser: argparse.ArgumentParser, *, episodes: int | None = None) -> None:
     """Add the options that say which episodes are played."""
     parser.add_argument(
         "--difficulty", type=int, choices=sorted(DIFFICULTIES), default=max(DIFFICULTIES), help="of generated levels"
     )
     parser.add_argument("--episodes", type=positive, default=episodes, help="number of episodes")
-    parser.add_argument("--seed", type=int, default=seed, help="seed of the first episode; episode i has seed + i")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode; episode i has seed + i")
     parser.add_argument("--time-limit", type=positive, metavar="STEPS", help="of an episode; the body's by default")
     parser.add_argument("--levels", type=Path, metavar="FILE", help="play the levels of a Boxoban text file instead")
     add_world_option(parser)
@@ -179,6 +182,7 @@ def add_module_options(parser: argparse.ArgumentParser) -> None:
             help=f"weights (.safetensors) of the learned {role}, or a class of your own to play it",
         )
     parser.add_argument("--device", default="cpu", help="device of the learned modules")
+    parser.add_argument("--threads", type=positive, default=1, help="threads of the networks and of batched physics")
     parser.add_argument(
         "--look-around",
         type=int,
@@ -213,7 +217,7 @@ def stack_from(arguments: argparse.Namespace) -> Stack:
         if role not in ROLES:
             raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
         choices[role] = Choice(role, ORACLE)
-    return Stack(choices, arguments.device, arguments.look_around)
+    return Stack(choices, arguments.device, arguments.look_around, arguments.threads)
 
 
 def import_from_here(path: Sequence[str] = ("",)) -> None:

@@ -125,7 +125,7 @@ class Processes:
         self._directory = tempfile.TemporaryDirectory(prefix="mujoban-")
         folder = Path(self._directory.name)
         # A simulator that is started again has to know where it was.
-        parameters["simulator"]["progress_file"] = str(folder / "progress.json")
+        parameters["simulator"]["resume_file"] = str(folder / "moment.safetensors")
         self._parameter_file = folder / "parameters.yaml"
         write_parameters(parameters, self._parameter_file)
         self._children = {name: self._start(name) for name in NODES}

@@ -60,6 +60,7 @@ def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Para
             "module": choice.source,
             "weights": "" if choice.weights is None else str(choice.weights),
             "device": stack.device,
+            "threads": stack.threads,
         }
     for role in LOOKING_ROLES:
         parameters[role]["look_around"] = stack.look_around_ticks

@@ -35,6 +35,7 @@ from mujoban_core import children
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.signals import StopSignal, interrupt_status, interruptible, leave
+from mujoban_core.threads import set_threads
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec, LazyEpisodes, after_moves
@@ -123,11 +124,9 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
         OSError: If a bag cannot be written.
         Interrupted: If the process was asked to end; the bags are whole then.
     """
-    import torch
-
     from bringup.rollout_recorder import Recorder
 
-    torch.set_num_threads(1)
+    set_threads(job.stack.threads)
     policy: SensePlanAct = job.stack.policy()
     if job.disturbance is not None:
         policy = disturbed(policy, job.disturbance, np.random.default_rng(job.seed))

@@ -26,6 +26,7 @@ from bringup.video import EDGE, VideoNode
 from mujoban_core import children
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.signals import StopSignal
+from mujoban_core.threads import set_threads
 from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
 from mujoban_msgs_py.runtime.tick_node import init_ros, spin
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -102,6 +103,7 @@ def play(
     )
     with ExitStack() as exits:
         stop = exits.enter_context(StopSignal())
+        set_threads(stack.threads)
         clear_shared_memory()
         exits.enter_context(claim_domain())
         init_ros()

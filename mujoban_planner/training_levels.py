@@ -109,8 +109,7 @@ class TrainingLevels:
     def state(self) -> State:
         """Return all that changes."""
         rates = {"solved": self._solved.tolist(), "tried": self._tried.tolist()}
-        failed = [list(ticket) for ticket in self._failed]
-        return State({"next": self._next, "rng": self._rng.bit_generator.state, "failed": failed, **rates})
+        return State({"next": self._next, "rng": self._rng.bit_generator.state, "failed": self._failed, **rates})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""

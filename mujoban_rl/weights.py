@@ -38,8 +38,7 @@ class WeightsError(ValueError):
 
 def digest(path: str | Path) -> str:
     """Return the SHA-256 of a file in hexadecimal."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def record_path(path: str | Path) -> Path:

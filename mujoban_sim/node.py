@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +16,17 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from mujoban_core.files import write_atomically
 from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
+from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.observation import ObservationPublisher
+from mujoban_sim.pace import Pace
 from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sim.resume import Moment, MomentFile, Place
 from mujoban_sim.tick_messages import TickLabel
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
@@ -45,20 +46,9 @@ PARAMETERS: dict[str, Any] = {
     "resend_after": 0.5,
     "await_recorder": False,
     "top_camera_size": 256,
-    "progress_file": "",
+    "resume_file": "",
 }
 """Parameters of the simulator and their defaults."""
-
-
-class Progress(NamedTuple):
-    """What a simulator that is started again has to know."""
-
-    index: int = 0
-    """Episode of the run that is being played."""
-    starts: int = 0
-    """Episodes started so far: the number of the episode in its messages."""
-    stamp: int = 0
-    """Simulated time before the episode's first tick [ns]."""
 
 
 class SimulatorNode(Node):
@@ -77,8 +67,8 @@ class SimulatorNode(Node):
         resend_after: Seconds without an answer after which a tick is offered again in lockstep.
         await_recorder: Whether in lockstep a recorder must have acknowledged a tick before the next.
         top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
-        progress_file: Where the node keeps what it plays, so that it starts the same episode again after it was
-            killed; empty means nowhere.
+        resume_file: Where the node keeps every tick that it offers, so that it goes on from there after it was killed;
+            empty means nowhere.
 
     Services: `/reset` starts the episode again, `/pause` (true or false) holds the world, `/step` advances a held
     world by one tick.
@@ -117,11 +107,7 @@ class SimulatorNode(Node):
         if not self._speed >= 0:
             raise ValueError(f"realtime is {self._speed}: expected a speed above 0, or 0 for lockstep")
         self._observation = ObservationPublisher(self, self.world, self._settings["top_camera_size"])
-        self._progress = self._read_progress()
-        # What is missing to draw with shows now, and the first tick is as quick as the others.
-        self.world.reset([0], [self.episodes[self._progress.index]])
-        self.world.render()
-        self._stamp = self._first_stamp = self._progress.stamp
+        self._place = Place()
         self._torque: NDArray[np.float32] | None = None
         self._held_torque = np.zeros(self.world.body.action_size, np.float32)
         self._instruction: conversions.InstructionReading | None = None
@@ -129,9 +115,30 @@ class SimulatorNode(Node):
         self._recorded = False
         self._paused = False
         self._steps_due = 0
+        self._destroyed = False
         self._started: float | None = None
+        path = self._settings["resume_file"]
+        self._file = MomentFile(Path(path)) if path else None
+        self._resumed = self._restore()
+        # What is missing to draw with shows now, and the first tick is as quick as the others.
+        self.world.render()
+        self._pace = Pace(self._speed)
         self._listen()
+        report_on(self, self._condition)
         self._start_timer = self.create_timer(MATCH_PERIOD, self._start_when_complete)
+
+    def destroy_node(self) -> None:
+        """End the node; what an executor still has in its queue for it is left alone."""
+        self._destroyed = True
+        super().destroy_node()
+
+    @property
+    def _over(self) -> bool:
+        return self._destroyed or self.finished.done()
+
+    @property
+    def _stamp(self) -> int:
+        return self._place.stamp
 
     @property
     def seconds(self) -> float:
@@ -168,50 +175,62 @@ class SimulatorNode(Node):
             return
         self._start_timer.cancel()
         self._started = time.perf_counter()
-        self._begin(self._progress.index)
+        if self._resumed:
+            self._offer()
+        else:
+            self._begin(self._place.index)
+        self._pace.start(self._started)
         if self._speed > 0:
             self.create_timer(CONTROL_PERIOD / self._speed, self._on_clock)
         else:
             self.create_timer(self._settings["resend_after"] / 2, self._offer_again)
 
-    def _read_progress(self) -> Progress:
-        path = self._settings["progress_file"]
-        if not path or not Path(path).is_file():
-            return Progress()
-        progress = Progress(**json.loads(Path(path).read_text()))
-        # Stamps never repeat: skip the time that the interrupted episode can have used.
-        return progress._replace(stamp=progress.stamp + (self.world.time_limit + 1) * TICK)
+    def _restore(self) -> bool:
+        """Take up the moment that an earlier process has left, or the first episode; return whether there was one."""
+        moment = None if self._file is None else self._file.read()
+        if moment is None:
+            self.world.reset([0], [self.episodes[0]])
+            return False
+        self._place, self._held_torque = moment.place, moment.torque
+        self._in_force = conversions.InstructionReading(moment.place.sequence, moment.place.direction)
+        self.world.restore([0], moment.world)
+        return True
 
-    def _write_progress(self) -> None:
-        path = self._settings["progress_file"]
-        if path:
-            write_atomically(Path(path), json.dumps(self._progress._asdict()).encode())
+    def _keep(self) -> None:
+        if self._file is not None:
+            self._file.write(Moment(self._place, self._held_torque, dict(self.world.snapshot([0]))))
 
     # Ticks
 
     def _begin(self, index: int) -> None:
-        self._progress = Progress(index, self._progress.starts + 1, self._stamp)
-        self._write_progress()
+        self._place = self._place._replace(index=index, starts=self._place.starts + 1)
         self.world.reset([0], [self.episodes[index]])
         self._held_torque[:] = 0.0
         self._in_force = conversions.InstructionReading(0, 0)
+        self._next()
+
+    def _next(self) -> None:
+        """Go on to the next tick."""
+        sequence, direction = self._in_force
+        self._place = self._place._replace(stamp=self._stamp + TICK, sequence=sequence, direction=direction)
+        self._keep()
         self._offer()
 
     def _offer(self) -> None:
-        """Publish the next tick."""
-        self._stamp += TICK
+        """Publish the tick and wait for what the modules make of it."""
         self._torque = self._instruction = None
         self._recorded = not self._settings["await_recorder"]
         self._publish()
 
     def _publish(self) -> None:
         self._offered = time.perf_counter()
-        label = TickLabel(self._stamp, self._progress.starts, self.episodes.difficulty, self._in_force.sequence)
+        label = TickLabel(self._stamp, self._place.starts, self.episodes.difficulty, self._in_force.sequence)
         self._observation.publish(label)
 
     def _offer_again(self) -> None:
         """Repeat a tick that stays without an answer: a node may have been started since."""
-        if not self._answered and time.perf_counter() - self._offered > self._settings["resend_after"]:
+        waited = time.perf_counter() - self._offered > self._settings["resend_after"]
+        if waited and not (self._answered or self._over):
             self.counts["repeated ticks"] += 1
             self._publish()
 
@@ -226,7 +245,7 @@ class SimulatorNode(Node):
 
     def _proceed(self) -> None:
         """In lockstep, go on as soon as the tick has been answered."""
-        while self._speed == 0 and self._answered and self._may_step() and not self.finished.done():
+        while not self._over and self._speed == 0 and self._answered and self._may_step():
             self._advance()
 
     def _may_step(self) -> bool:
@@ -238,8 +257,14 @@ class SimulatorNode(Node):
         return True
 
     def _on_clock(self) -> None:
-        if self.finished.done() or not self._may_step():
+        now = time.perf_counter()
+        if self._over:
             return
+        if not self._may_step():
+            self._pace.start(now)
+            return
+        if (complaint := self._pace.complaint(now)) is not None:
+            self.get_logger().warning(complaint)
         if not self._ended and self._torque is None:
             self.counts["late answers"] += 1
         self._advance()
@@ -257,10 +282,11 @@ class SimulatorNode(Node):
             self.world.instruct(np.array([self._in_force.direction]), np.array([issued]))
         self.world.step(self._held_torque[None])
         self.ticks += 1
-        self._offer()
+        self._pace.tick(late=self._torque is None)
+        self._next()
 
     def _end(self) -> None:
-        following = self._progress.index + 1
+        following = self._place.index + 1
         if following < len(self.episodes):
             self._begin(following)
         else:
@@ -299,10 +325,20 @@ class SimulatorNode(Node):
 
     def _is_known(self, stamp: int, topic: str) -> bool:
         """Tell whether a stamp is that of a tick of this run; repeated answers to earlier ticks are."""
-        if self._first_stamp < stamp <= self._stamp and stamp % TICK == 0:
+        if 0 < stamp <= self._stamp and stamp % TICK == 0:
             return True
         self._reject("messages of an unknown episode", f"{topic}: stamp {stamp} ns belongs to no episode of this run")
         return False
+
+    def _condition(self) -> Condition:
+        """Return what /diagnostics says of this node."""
+        rate = self.ticks / self.seconds if self.seconds else 0.0
+        values = {"ticks": self.ticks, "ticks/s": f"{rate:.1f}", "episode": self._place.starts, **self.counts}
+        if self._started is None:
+            return Condition("waiting for the graph to be complete", values)
+        if not self._pace.kept:
+            return Condition("real time is not kept", values, warning=True)
+        return Condition("paused" if self._paused else "running", values)
 
     def _reject(self, kind: str, reason: str) -> None:
         self.counts[kind] += 1
@@ -313,9 +349,9 @@ class SimulatorNode(Node):
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._started is not None and not self.finished.done()
         if response.success:
-            self._begin(self._progress.index)
-            spec = self.episodes[self._progress.index]
-            response.message = f"episode {self._progress.starts} starts with seed {spec.seed}"
+            self._begin(self._place.index)
+            spec = self.episodes[self._place.index]
+            response.message = f"episode {self._place.starts} starts with seed {spec.seed}"
         else:
             response.message = "no episode is running"
         return response

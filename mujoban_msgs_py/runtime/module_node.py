@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 from mujoban_core.interfaces import GroundTruth
 from mujoban_core.look_around import LOOKING_ROLES, look_around
 from mujoban_core.plugins import LEARNED, load_module
+from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import described
 from mujoban_msgs_py.runtime.tick_node import Input, Output, TickNode
@@ -40,6 +41,8 @@ class ModuleNode(TickNode):
             runs loads them, and the module's memory restarts with the next tick. Weights that cannot be loaded
             are refused, and the old ones stay.
         device: Device of the learned module; setting it loads the weights again.
+        threads: Threads of PyTorch in this process; at batch 1 further ones gain little on an idle machine, and on a
+            busy one they wait for each other. Fixed when the node starts.
         look_around: Of planner and controller alone: ticks of a look, which is a turn on the spot; 0 for none. Fixed
             when the node starts.
     """
@@ -55,6 +58,8 @@ class ModuleNode(TickNode):
             ValueError: If the module or its weights cannot be loaded.
         """
         super().__init__(self.role, **options)
+        threads: Any = self.declare_parameter("threads", 1, described("of PyTorch", fixed=True)).value
+        set_threads(threads)
         which = described("learned, oracle or package.module:Class", fixed=True)
         source: Any = self.declare_parameter("module", LEARNED, which).value
         self._source: str = source

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -31,6 +32,7 @@ from mujoban_core.signals import StopSignal, interruptible
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import LOG_PERIOD, reject
 from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import EPISODE, Topic
 
@@ -68,6 +70,8 @@ class TickNode(Node):
         self._outputs: Sequence[Output] = ()
         self._open: tuple[int, dict[str, Any]] | None = None
         self._offers = 0
+        self._answered = 0
+        self._reported = (0, time.monotonic())
         self._destroyed = False
 
     def destroy_node(self) -> None:
@@ -79,6 +83,17 @@ class TickNode(Node):
     def dropped(self) -> Counter[str]:
         """Messages that belong to no tick that was ever complete, by topic."""
         return Counter() if self._join is None else self._join.dropped
+
+    def _condition(self) -> Condition:
+        (before, since), now = self._reported, time.monotonic()
+        self._reported = (self._answered, now)
+        values = {
+            "ticks answered": self._answered,
+            "ticks/s": f"{(self._answered - before) / (now - since):.1f}",
+            "dropped messages": self.dropped.total(),
+            **self.counts,
+        }
+        return Condition("answering" if self._answered > before else "waiting for a tick", values)
 
     @abstractmethod
     def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
@@ -95,6 +110,7 @@ class TickNode(Node):
         """Subscribe to `/episode` and to what `answer` needs besides."""
         every = [Input(EPISODE, checked(EPISODE)), *inputs]
         self._join = Synchroniser([i.topic.name for i in every])
+        report_on(self, self._condition)
         for topic, decode in every:
             receive = partial(self._receive, topic, decode)
             self.create_subscription(topic.type, topic.name, receive, topic.qos, raw=True)
@@ -113,6 +129,7 @@ class TickNode(Node):
         if outputs is None:
             return
         self._open, self._handled, self._outputs = None, stamp, outputs
+        self._answered += 1
         self._publish()
 
     def _receive(self, topic: Topic, decode: Callable[[Any], Any] | None, message: bytes) -> None:

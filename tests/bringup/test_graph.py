@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -47,18 +48,37 @@ def test_an_episode_ends_though_all_modules_are_killed_and_started_again(play_gr
     assert result.solved
 
 
-def test_a_simulator_that_is_started_again_plays_the_same_episode_at_later_stamps(play_graph, tmp_path):
-    graph = play_graph(episodes=Episodes(2, 0, difficulty=1), progress_file=str(tmp_path / "progress.json"))
-    graph.spin_until(lambda: len(graph.monitor.results) == 1 and graph.monitor.episode.step == 10)
-    before = graph.monitor.episode
-    graph.graph.stop("simulator")
-    graph.graph.start("simulator")
-    first, second = graph.finish()
-    after = graph.monitor.episode
-    assert (first.seed, second.seed) == (0, 1) and first.solved and second.solved
-    assert after.seed == before.seed and after.level == before.level and after.episode > before.episode
-    stamps = list(graph.said.episodes)
-    assert stamps == sorted(stamps) and all(stamp % TICK == 0 for stamp in stamps)
+def test_a_simulator_that_is_killed_goes_on_at_the_same_tick_as_if_nothing_had_happened(play_graph, tmp_path):
+    episodes = Episodes(2, 0, difficulty=1)
+    undisturbed = play_graph(episodes=episodes)
+    expected = undisturbed.finish()
+    undisturbed.__exit__(None, None, None)
+    graph = play_graph(episodes=episodes, resume_file=str(tmp_path / "moment.safetensors"))
+    for ticks in (10, len(undisturbed.said.torque) - 5):
+        graph.spin_until(lambda ticks=ticks: len(graph.said.torque) >= ticks)
+        graph.graph.stop("simulator")
+        graph.graph.start("simulator")
+    assert graph.finish() == expected
+    assert graph.said.torque == undisturbed.said.torque and graph.said.reward == undisturbed.said.reward
+    assert [e.episode for e in graph.said.episodes.values()] == [e.episode for e in undisturbed.said.episodes.values()]
+
+
+def test_a_file_that_is_no_moment_of_a_run_is_named(play_graph, tmp_path):
+    file = tmp_path / "moment.safetensors"
+    file.write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"moment\.safetensors: expected the moment of a run"):
+        play_graph(resume_file=str(file))
+
+
+def test_every_node_says_on_diagnostics_how_it_is(play_graph):
+    graph = play_graph(time_limit=4000)
+    heard = {}
+    graph.tap.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda message: heard.update({s.name: s for s in message.status}), 10
+    )
+    graph.spin_until(lambda: len(heard) == len(NODES) and heard["/simulator"].message == "running")
+    assert set(heard) == {f"/{name}" for name in NODES}
+    assert "dropped messages" in {value.key for value in heard["/planner"].values}
 
 
 def test_processes_that_are_killed_are_started_again(ros, oracles):

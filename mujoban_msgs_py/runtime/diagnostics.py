@@ -1,0 +1,42 @@
+"""What a node says of itself on /diagnostics, once a second (REP 107)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+TOPIC: Final = "/diagnostics"
+PERIOD: Final = 1.0
+"""Seconds between two messages."""
+
+
+class Condition(NamedTuple):
+    """How a node is."""
+
+    message: str
+    """In one line."""
+    values: Mapping[str, Any]
+    """Figures by name."""
+    warning: bool = False
+
+
+def report_on(node: Node, look: Callable[[], Condition]) -> None:
+    """Have a node publish, every `PERIOD`, the condition that `look` returns."""
+    publisher = node.create_publisher(DiagnosticArray, TOPIC, 10)
+
+    def publish() -> None:
+        condition = look()
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if condition.warning else DiagnosticStatus.OK,
+            name=node.get_fully_qualified_name(),
+            message=condition.message,
+            values=[KeyValue(key=key, value=str(value)) for key, value in condition.values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = node.get_clock().now().to_msg()
+        publisher.publish(array)
+
+    node.create_timer(PERIOD, publish)

@@ -1,0 +1,59 @@
+"""Whether real time is kept: how fast simulated time goes, and how many answers come late."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from mujoban_core.grid import CONTROL_PERIOD
+
+WINDOW: Final = 10.0
+"""Seconds that are looked at together; at most one warning comes of each."""
+KEPT: Final = 0.95
+"""Share of the wanted speed from which on real time counts as kept."""
+LATE: Final = 0.05
+"""Share of late answers up to which it does."""
+
+
+@dataclass
+class Pace:
+    """Simulated against wall time, window by window."""
+
+    speed: float
+    """Simulated seconds per second that are wanted; 0 is lockstep, which keeps to no clock."""
+    ticks: int = 0
+    """In the window so far."""
+    late: int = 0
+    """Ticks of the window without a torque of their own."""
+    _since: float = 0.0
+    _kept: bool = True
+
+    def start(self, now: float) -> None:
+        """Begin a window, as after a pause; `now` in seconds of a clock that never jumps."""
+        self.ticks, self.late, self._since = 0, 0, now
+
+    def tick(self, *, late: bool) -> None:
+        """Count a tick."""
+        self.ticks += 1
+        self.late += late
+
+    @property
+    def kept(self) -> bool:
+        """Whether real time was kept in the last window."""
+        return self._kept
+
+    def complaint(self, now: float) -> str | None:
+        """At the end of a window, begin the next and return what is wrong in one line, if anything is."""
+        seconds = now - self._since
+        if self.speed == 0 or seconds < WINDOW:
+            return None
+        wanted = self.speed / CONTROL_PERIOD
+        rate, share = self.ticks / seconds, self.late / max(1, self.ticks)
+        self.start(now)
+        self._kept = rate >= KEPT * wanted and share <= LATE
+        if self._kept:
+            return None
+        return (
+            f"real time is not kept: {rate:.1f} of {wanted:.1f} ticks/s, {100 * share:.0f} % of the answers late "
+            f"in the last {seconds:.0f} s; the machine is too busy or too slow for this speed"
+        )
