@@ -18,12 +18,13 @@ import tyro
 
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import AbstractEnvironment
-from mujoban_planner.boards import abstract_states
+from mujoban_planner.boards import BitBoards, abstract_states, bit_boards, state_tensor
 from mujoban_planner.export import export
 from mujoban_planner.imitation import ImitationConfig, imitation_loss
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.networks import RecurrentPlanner
 from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.samples import SampleBuffer, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import Teacher
@@ -109,6 +110,25 @@ def environment_steps_per_second(options: Options, batch: int = 4096) -> float:
     return batch * rate(lambda: environment.step(instruction), options.seconds, options.device)
 
 
+def pushes_per_cpu_second(options: Options, batch: int = 1024) -> float:
+    """Return pushes per CPU second of the environment of pushes: masks, steps, resets and abstract states."""
+    environment, boards = PushEnvironment(batch), bit_boards(generate_batch(5, range(batch)))
+    environment.reset_to(np.arange(batch), boards)
+    rng, calls, spent = np.random.default_rng(0), 0, 0.0
+    while spent < options.seconds:
+        start = time.process_time()
+        possible = environment.possible()
+        state_tensor(environment.boards)
+        spent += time.process_time() - start
+        push = (rng.random(possible.shape, dtype=np.float32) * possible).argmax(1)
+        start = time.process_time()
+        over = np.flatnonzero(environment.step(push).over)
+        environment.reset_to(over, BitBoards._make(column[over] for column in boards))
+        spent = spent + time.process_time() - start if calls else 0.0  # the first call compiles
+        calls += 1
+    return batch * (calls - 1) / spent
+
+
 def demonstrations_per_second(options: Options) -> float:
     """Return labelled levels per second and core, generation included."""
     teacher, rng, seeds = Teacher(), np.random.default_rng(0), iter(range(0, 10_000_000, 64))
@@ -139,6 +159,7 @@ def main() -> None:
             ),
         },
         "environment_steps_per_second": environment_steps_per_second(options),
+        "pushes_per_cpu_second": pushes_per_cpu_second(options),
         "demonstrated_levels_per_second": demonstrations_per_second(options),
         "device": options.device,
         "threads": options.threads,

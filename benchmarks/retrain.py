@@ -20,7 +20,7 @@ from typing import Any
 import tyro
 
 from mujoban_core.plugins import ROLES
-from mujoban_sokoban.generator import TEST_SEEDS
+from mujoban_sokoban.generator import VALIDATION_SEEDS
 
 PAIR = ("estimator", "termination")
 
@@ -68,7 +68,8 @@ def judge(weights: Path, held_out: Path, options: Options) -> dict[str, Any]:
     """Return the solve rate in the stack and the rates on held-out bags."""
     stack, bags = weights / "stack.json", weights / "bags.json"
     execute(
-        "bringup/evaluate.py", "--difficulty", options.difficulty, "--episodes", options.levels, "--seed", 1000,
+        "bringup/evaluate.py", "--difficulty", options.difficulty, "--episodes", options.levels,
+        "--seed", VALIDATION_SEEDS.start,
         *pair_options(weights), "--json", stack,
     )  # fmt: skip
     execute("-m", "mujoban_estimator.evaluate", "--bags", held_out, *pair_options(weights), "--json", bags)
@@ -91,7 +92,7 @@ def run(options: Options) -> dict[str, Any]:
     record = ("bringup/record.py", "--difficulty", options.difficulty, "--time-limit", 500, "--processes", 2)
     train = ("-m", "mujoban_estimator.train", "--threads", options.threads)
     execute(*record, "--out", first, "--episodes", options.weak_episodes, "--seed", 40_000_000, *oracles)
-    execute(*record, "--out", held_out, "--episodes", 16, "--seed", TEST_SEEDS.start + 500_000, *oracles)
+    execute(*record, "--out", held_out, "--episodes", 16, "--seed", VALIDATION_SEEDS.start + 500_000, *oracles)
     execute(
         *train, "--bags", first, "--run", options.run / "train_weak", "--out", weak,
         "--config.steps", options.weak_steps,

@@ -153,13 +153,13 @@ def positive(text: str) -> int:
     return number
 
 
-def add_episode_options(parser: argparse.ArgumentParser, *, episodes: int | None = None) -> None:
+def add_episode_options(parser: argparse.ArgumentParser, *, episodes: int | None = None, seed: int = 0) -> None:
     """Add the options that say which episodes are played."""
     parser.add_argument(
         "--difficulty", type=int, choices=sorted(DIFFICULTIES), default=max(DIFFICULTIES), help="of generated levels"
     )
     parser.add_argument("--episodes", type=positive, default=episodes, help="number of episodes")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode; episode i has seed + i")
+    parser.add_argument("--seed", type=int, default=seed, help="seed of the first episode; episode i has seed + i")
     parser.add_argument("--time-limit", type=positive, metavar="STEPS", help="of an episode; the body's by default")
     parser.add_argument("--levels", type=Path, metavar="FILE", help="play the levels of a Boxoban text file instead")
     add_world_option(parser)

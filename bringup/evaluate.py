@@ -22,13 +22,14 @@ from bringup.command import (
     run_command,
     stack_from,
 )
-from bringup.results import EpisodeResult, report, write_report
+from bringup.results import EpisodeResult, report, use_of_test_levels, write_report
 from bringup.rollout import rollout
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.threads import set_threads
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range
 
 PROG = "evaluate.py"
 
@@ -100,7 +101,7 @@ def evaluate(
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = Parser(PROG, description="Evaluate the stack on many levels in one vectorised rollout.")
-    add_episode_options(parser, episodes=256)
+    add_episode_options(parser, episodes=256, seed=VALIDATION_SEEDS.start)
     add_module_options(parser)
     parser.add_argument("--batch", type=positive, default=64, help="episodes that run at the same time")
     parser.add_argument("--graph", action="store_true", help="play through the ROS graph instead")
@@ -108,6 +109,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(command_line)
     import_from_here()
     episodes, stack = episodes_from(arguments), stack_from(arguments)
+    from mujoban_rl.weights import provenance
+
     set_threads(arguments.threads)
     if arguments.graph:
         from bringup.stack import PlayOptions, play
@@ -131,6 +134,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
             progress=True,
         )
         content = report(results, stack.identities(), world=arguments.world)
+    if arguments.levels is None and seed_range(arguments.seed, len(episodes)) == "test":
+        content["test_uses"] = [use_of_test_levels(content, provenance()["commit"])]
     if arguments.json is None:
         print(json.dumps(content, indent=2))
     else:

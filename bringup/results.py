@@ -77,6 +77,27 @@ def report(results: Sequence[EpisodeResult], weights: Mapping[str, str], **extra
     }
 
 
+def use_of_test_levels(content: Mapping[str, Any], commit: str | None) -> dict[str, Any]:
+    """Return the entry of a report's `test_uses` list: what was evaluated on test levels, and on which.
+
+    Args:
+        content: The report.
+        commit: Of the code.
+    """
+    seeds = [entry["seed"] for entry in content["episodes"]]
+    return {"commit": commit, "weights": content["weights"], "seeds": [min(seeds), max(seeds)]}
+
+
 def write_report(content: Mapping[str, Any], path: Path) -> None:
-    """Write a report as JSON, whole or not at all."""
+    """Write a report as JSON, whole or not at all; uses of the test range that the file lists are kept."""
+    if path.exists() and "test_uses" in content:
+        content = {**content, "test_uses": [*_noted_uses(path), *content["test_uses"]]}
     write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def _noted_uses(path: Path) -> list[Any]:
+    try:
+        earlier = json.loads(path.read_text())
+    except json.JSONDecodeError:
+        return []
+    return list(earlier.get("test_uses", [])) if isinstance(earlier, dict) else []

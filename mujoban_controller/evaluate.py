@@ -26,7 +26,7 @@ from mujoban_core.interfaces import Controller
 from mujoban_rl.weights import digest, load_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sim.presets import DEFAULT_WORLD
-from mujoban_sokoban.generator import TEST_SEEDS
+from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Options:
     weights: Path | None = None
     """Weights of camera policy or teacher; those that ship by default."""
     episodes: int = 128
-    seed: int = 0
+    seed: int = VALIDATION_SEEDS.start
     """Seed of the first level; level i has seed + i."""
     difficulty: int = 5
     body: str = "ball"
@@ -56,8 +56,8 @@ class Options:
         """Reject what cannot be judged."""
         if self.episodes < 1:
             raise ValueError(f"--episodes {self.episodes}: expected at least 1")
-        if self.seed not in TEST_SEEDS or self.seed + self.episodes > TEST_SEEDS.stop:
-            raise ValueError(f"--seed {self.seed}: expected test seeds, {TEST_SEEDS.start} to {TEST_SEEDS.stop - 1}")
+        if seed_range(self.seed, self.episodes) == "training":
+            raise ValueError(f"--seed {self.seed}: expected seeds of validation or test, not of training")
         if self.driver == "teacher" and self.weights is None:
             raise ValueError("--driver teacher: expected --weights of a privileged policy")
 

@@ -21,7 +21,7 @@ from mujoban_core.stats import wilson_interval
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.episodes import EpisodeSpec
-from mujoban_sokoban.generator import generate_level
+from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_level
 
 
 def kind_name(outcome: Outcome) -> str:
@@ -101,7 +101,7 @@ def judge(
     planner: Planner,
     *,
     episodes: int,
-    first_seed: int = 0,
+    first_seed: int = VALIDATION_SEEDS.start,
     difficulty: int = 5,
     body: str = "ball",
     world: str = DEFAULT_WORLD,

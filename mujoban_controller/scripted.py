@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mujoban_controller.goal_features import goal_offsets
 from mujoban_controller.goal_task import GoalTask
 from mujoban_core.grid import OFFSETS_XY
-from mujoban_sim.driving import SteeringGains, limit_speed, plot_course, roll_and_steer
+from mujoban_sim.driving import SteeringGains, limit_speed, plot_course, push_speed, roll_and_steer, touches
 from mujoban_sim.goals import GoalKind
 
 
@@ -32,12 +32,6 @@ class TeacherGains(SteeringGains):
     speed: float = 1.5
     move_braking: float = 3.3
     """Speed per cell that is left of a move, or of the way back to a lane or centre."""
-    push_braking: float = 4.0
-    """Speed per cell that is left of a push, close to its end."""
-    push_deceleration: float = 2.0
-    """Deceleration before that, in cells per s^2. Friction stops a box with 4.9: it never leaves the robot."""
-    push_lag: float = 0.08
-    """Seconds by which it brakes earlier than that: the wheel's lag."""
     lane_tolerance: float = 0.3
     move_lane_gain: float = 1.5
     """Weight of the distance from the lane in the direction to drive in."""
@@ -45,7 +39,6 @@ class TeacherGains(SteeringGains):
     """The same for pushes. There are 0.3 cells until it touches the box: if it still bends to its lane then, friction
     drags the box across, and the box may come to rest between the next pegs, out of tolerance for good."""
     look_ahead: float = 0.5
-    roll_gain: float = 1.0
     hold_radius: float = 0.06
     """Distance from the centre within which it stands still when it is to hold."""
     overshot: float = 0.1
@@ -73,18 +66,12 @@ def scripted_driver(task: GoalTask, offset: NDArray[np.float64] | None = None) -
     lane_gain = np.where(push, g.push_lane_gain, g.move_lane_gain)[:, None]
     course = plot_course(target, world.pose, lane, lane_gain, g, world.body.cell_size)
     left = np.where(course.recentre, course.off_lane, course.along)
-    pushed = _push_speed(offsets[:, 2], task.forward_speed)
-    speed = limit_speed(np.where(push & ~course.recentre, pushed, g.move_braking * left), g.speed, course, g)
+    pushing = push & ~course.recentre
+    wanted = np.where(pushing, push_speed(offsets[:, 2], task.forward_speed, g), g.move_braking * left)
+    speed = limit_speed(wanted, g.speed, course, g)
+    box = world.box_position[np.arange(world.batch), goals.box_index]
+    pushing &= touches(world.pose, box, lane, g, world.body.cell_size)
     # The course to a centre that is reached already is noise, which a student could only learn as such.
     holding = ~(push | move) & (np.linalg.norm(to_target, axis=1) < g.hold_radius)
     speed, error = np.where(holding, 0.0, speed), np.where(holding, 0.0, course.error)
-    return roll_and_steer(speed, error, task.forward_speed, world.velocity[:, 2], g)
-
-
-def _push_speed(box_left: NDArray[np.float64], speed: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the speed for a box with `box_left` cells to go: a constant deceleration that ends in creeping."""
-    g = GAINS
-    left = np.maximum(box_left - g.push_lag * np.maximum(speed, 0.0), 0.0)
-    joint = g.push_deceleration / g.push_braking
-    steady = np.sqrt(np.maximum(2.0 * g.push_deceleration * left - joint**2, 0.0))
-    return np.where(left < joint / g.push_braking, g.push_braking * left, steady)
+    return roll_and_steer(speed, error, pushing, task.forward_speed, world.velocity[:, 2], g)

@@ -32,17 +32,13 @@ _CLIP = 1.0
 
 
 @dataclass(frozen=True)
-class ImitationConfig(LessonConfig, NetworkConfig):
-    """What defines an imitation run."""
+class LearnerConfig(NetworkConfig):
+    """What defines a network and how it learns from labelled states."""
 
     learning_rate: float = 1e-3
     weight_decay: float = 1e-3
     warm_up: float = 0.02
     """Share of the schedule in which the learning rate rises."""
-    horizon_seconds: float = math.inf
-    """Training time at which the cosine schedule ends, whichever of the two horizons comes first."""
-    horizon_samples: float = 4e6
-    """Samples at which the cosine schedule ends."""
     plan_weight: float = 3.0
     """Weight of the plan map in the loss."""
     value_weight: float = 0.02
@@ -55,9 +51,20 @@ class ImitationConfig(LessonConfig, NetworkConfig):
     """Decay of the averaged weights, which are what is played and shipped."""
     init: str | None = None
     """Weights to start from, where names and shapes agree."""
+    seed: int = 0
 
 
-def imitation_loss(planner: nn.Module, batch: Batch, config: ImitationConfig) -> tuple[Tensor, dict[str, Tensor]]:
+@dataclass(frozen=True)
+class ImitationConfig(LessonConfig, LearnerConfig):
+    """What defines an imitation run."""
+
+    horizon_seconds: float = math.inf
+    """Training time at which the cosine schedule ends, whichever of the two horizons comes first."""
+    horizon_samples: float = 4e6
+    """Samples at which the cosine schedule ends."""
+
+
+def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the loss and its parts, scalars.
 
     Policy: -log of the probability of all right instructions together. Q: regression of the demonstration's return
@@ -100,7 +107,7 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: ImitationConfig) ->
 class ImitationLearner(Learner[Batch]):
     """Trains a network on lessons; the moving average of its weights is what is played and shipped."""
 
-    def __init__(self, config: ImitationConfig, device: torch.device | str = "cpu") -> None:
+    def __init__(self, config: LearnerConfig, device: torch.device | str = "cpu") -> None:
         """Make the network; on a CPU it trains in bfloat16."""
         self.config, self.device = config, torch.device(device)
         torch.manual_seed(config.seed)  # the initial weights

@@ -38,9 +38,9 @@ from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, Weighed, 
 from mujoban_planner.propagation import PLANES, propagate
 
 CAUTION = 4.0
-"""Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/planner.md)."""
+"""Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/research)."""
 DOUBT = 0.02
-"""Probability that a push is deadly from which on the planner looks again before it, by default (docs/planner.md)."""
+"""Probability that a push is deadly from which on the planner looks again before it, by default (docs/research)."""
 
 
 class LearnedPlanner(nn.Module, Planner):
@@ -99,11 +99,19 @@ class LearnedPlanner(nn.Module, Planner):
 
     def read(self, abstract_state: Tensor) -> tuple[PlannerOutput, Tensor]:
         """Return the outputs before the way to a push counts, and the input planes, [B, 4, I, I]."""
+        features, planes, reachable = self.perceive(abstract_state)
+        return self.heads(features, planes, reachable), planes
+
+    def perceive(self, abstract_state: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return what the read-out reads: features [B, C, I, I], input planes [B, 4, I, I], where the robot can walk.
+
+        The last is [B, I, I], or None without propagation.
+        """
         planes = input_planes(abstract_state)
         spread = propagate(planes) if self.propagation else None
         inputs = planes if spread is None else torch.cat([planes, spread], 1)
         features = self.features(inputs.contiguous(memory_format=torch.channels_last))
-        return self.heads(features, planes, None if spread is None else spread[:, 0]), planes
+        return features, planes, None if spread is None else spread[:, 0]
 
     @property
     def inputs(self) -> int:

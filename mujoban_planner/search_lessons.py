@@ -24,22 +24,26 @@ from mujoban_core.grid import DIFFICULTIES
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import BitBoards, level_batch
 from mujoban_planner.forest import Forest, Verdicts
-from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch, unlabelled
 from mujoban_planner.search import grow
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import DEAD_SHARE, judge_instructions, label_dead, label_demonstrations, possible_pushes
 from mujoban_planner.training_levels import Ticket, TrainingLevels
-from mujoban_rl.engine import Source, State
+from mujoban_planner.uncertainty import blur, hide_unseen
+from mujoban_planner.validation import NetworkConfig
+from mujoban_rl.actors import Actor, Experience
+from mujoban_rl.engine import State
 from mujoban_sokoban.solver import label_solutions
 
 _LONG: Final = 15
 """Expansions from which on a search may have proved something that is not seen at once."""
+_NONE: Final = np.zeros(0, np.uint64)
+_NO_BOARDS: Final = BitBoards(_NONE, _NONE, _NONE, np.zeros(0, np.uint8))
 
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """What defines the searches that a planner learns from."""
+    """What defines searches, and the batches of what they taught."""
 
     trees: int = 256
     """Searches at once."""
@@ -49,8 +53,8 @@ class SearchConfig:
     """How often a level that was not solved comes again."""
     retried: float = 0.15
     """Share of such levels."""
-    reuse: float = 3.0
-    """Samples learned from for each new one."""
+    steps: int = 8
+    """Steps of every search that are delivered at once."""
     walks: float = 0.25
     """Share that is kept of the states between two pushes."""
     verdicts: int = 6
@@ -59,104 +63,135 @@ class SearchConfig:
     """Share of a batch that holds such states."""
     buffer: int = 200_000
     """Samples kept of each kind."""
+    batch_size: int = 256
+    noise: float = 0.0
+    """Share of a batch whose abstract states are blurred, as estimates are."""
+    hidden: float = 0.0
+    """Share of a batch that shows only what the robot may have seen so far."""
 
 
-class SearchLessons(Source[Batch]):
-    """Batches of what rolling searches found; a sample is one network evaluation of a search."""
+class SearchActor(Actor):
+    """Searches all the time; delivers what searches that ended have found and proved. A step is a network evaluation.
 
-    def __init__(self, planner: LearnedPlanner, config: SearchConfig, batch_size: int, seed: int) -> None:
+    Delivered are the columns of `Samples`: those of states on the ways that were found under `way.`, those of states
+    off them, with what was proved there, under `verdict.`.
+    """
+
+    def __init__(self, network: NetworkConfig, config: SearchConfig, stream: int) -> None:
         """Start without a search.
 
         Args:
-            planner: Guide, which gets the published weights; not shared with the learner.
+            network: What to build for the weights that guide the searches.
             config: What defines the searches.
-            batch_size: Samples of a batch.
-            seed: Of levels and batches.
+            stream: Of levels and randomness.
         """
-        self.planner, self.config, self.batch_size = planner.eval(), config, batch_size
-        self._levels = TrainingLevels(seed, retried=config.retried, retries=config.retries)
+        self.planner, self.config = network.build().eval(), config
+        self.planner.lay_out()
+        self._levels = TrainingLevels(stream, retried=config.retried, retries=config.retries)
         self._forest = Forest(config.trees, config.expansions << config.retries, MOVE_LIMIT)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
-        self._rng = np.random.default_rng([seed, 4])
-        self._ways, self._verdicts = SampleBuffer(config.buffer), SampleBuffer(config.buffer)
-        self._owed = 0.0
-        """Samples that may be learned from before new ones are due."""
-        self._found = 0
+        self._rng = np.random.default_rng([stream, 4])
 
-    def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
+    def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
         """Guide by newer weights."""
         self.planner.load_state_dict(weights)
 
-    def next_batch(self) -> Batch:
-        """Search until there is enough that is new; return a batch under random symmetries."""
-        while self._owed < self.batch_size or self._ways.size < 2 * self.batch_size:
-            self._advance()
-        self._owed -= self.batch_size
-        judged = int(self.batch_size * self.config.judged) if self._verdicts.size > self.batch_size else 0
-        parts = [self._ways.draw(self.batch_size - judged, self._rng)]
-        if judged:
-            parts.append(self._verdicts.draw(judged, self._rng))
-        return make_batch(concatenate(parts), self._rng.integers(0, SYMMETRIES, self.batch_size))
-
-    def statistics(self) -> dict[str, float]:
-        """Return the solve rates of searches at the first try, and how many states they taught."""
-        rates = zip(DIFFICULTIES, self._levels.solve_rates.tolist(), strict=True)
-        counts = {"ways": self._ways.added, "verdicts": self._verdicts.added, "levels_solved": self._found}
-        return {f"search/{d}": rate for d, rate in rates} | {k: float(v) for k, v in counts.items()}
-
-    @property
-    def _parts(self) -> dict[str, TrainingLevels | Forest | SampleBuffer]:
-        return {"levels": self._levels, "forest": self._forest, "ways": self._ways, "verdicts": self._verdicts}
+    def act(self) -> Experience:
+        """Let every search take so many steps."""
+        lessons: dict[str, list[Samples]] = {"way": [unlabelled(_NO_BOARDS)], "verdict": [unlabelled(_NO_BOARDS)]}
+        ended: dict[str, list[bool]] = {f"search/{d}": [] for d in DIFFICULTIES}
+        for _ in range(self.config.steps):
+            self._advance(lessons, ended)
+        arrays = {f"{k}.{n}": column for k, v in lessons.items() for n, column in concatenate(v)._asdict().items()}
+        arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        statistics = {name: np.array(solved, np.float32) for name, solved in ended.items()}
+        return Experience(arrays, self.config.trees * self.config.steps, statistics)
 
     def state(self) -> State:
-        """Return levels, trees, buffers and random state."""
-        counters = {"owed": self._owed, "found": self._found, "tickets": self._tickets}
-        own = State({"rng": self._rng.bit_generator.state, **counters})
-        return State.of({"own": own} | {name: part.state() for name, part in self._parts.items()})
+        """Return levels, trees and random state."""
+        own = State({"rng": self._rng.bit_generator.state, "tickets": [list(ticket) for ticket in self._tickets]})
+        return State.of({"own": own, "levels": self._levels.state(), "forest": self._forest.state()})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
-        for name, part in self._parts.items():
-            part.restore(state.part(name))
+        self._levels.restore(state.part("levels"))
+        self._forest.restore(state.part("forest"))
         own = state.part("own").values
         self._rng.bit_generator.state = own["rng"]
-        self._owed, self._found = own["owed"], own["found"]
         self._tickets = [Ticket(*ticket) for ticket in own["tickets"]]
 
-    def _advance(self) -> None:
-        """Let every search take a step; learn from those that end, and start others in their place."""
+    def _advance(self, lessons: dict[str, list[Samples]], ended: dict[str, list[bool]]) -> None:
+        """Let every search take a step; learn from those that have ended, and start others in their place."""
         forest, config = self._forest, self.config
         budget = np.array([config.expansions << ticket.failures for ticket in self._tickets])
         over = np.flatnonzero(~forest.open | (forest.expansions >= budget))
         if over.size:
             planted = over[forest.trees.nodes[over] > 0]  # none is at first
-            self._learn(planted)
+            for row in planted.tolist():
+                ticket, solved = self._tickets[row], bool(forest.trees.solution[row] >= 0)
+                self._levels.report(ticket, solved)
+                if ticket.failures == 0:
+                    ended[f"search/{ticket.difficulty}"].append(solved)
+            self._learn(planted, lessons)
             boards, tickets = self._levels.draw(len(over))
             forest.plant(over, boards)
             for row, ticket in zip(over.tolist(), tickets, strict=True):
                 self._tickets[row] = ticket
-        rows = np.arange(config.trees)
         with torch.autocast("cpu", torch.bfloat16):
-            grow(forest, rows, self.planner)
-        self.samples += config.trees
+            grow(forest, np.arange(config.trees), self.planner)
 
-    def _learn(self, rows: NDArray[np.int64]) -> None:
-        """Take what the searches in trees `rows`, [R], found and proved."""
-        solved = self._forest.trees.solution[rows] >= 0
-        for row, success in zip(rows.tolist(), solved.tolist(), strict=True):
-            self._levels.report(self._tickets[row], success)
-        self._found += int(solved.sum())
-        verdicts = {row: self._forest.judge(row) for row in rows.tolist()}
-        if solved.any():
-            ways = label_ways(self._forest, {row: verdicts[row] for row in rows[solved].tolist()}, self._rng)
+    def _learn(self, rows: NDArray[np.int64], lessons: dict[str, list[Samples]]) -> None:
+        """Add what the searches in trees `rows`, [R], found and proved."""
+        forest, config = self._forest, self.config
+        verdicts = {row: forest.judge(row) for row in rows.tolist()}
+        solved = {row: proved for row, proved in verdicts.items() if len(forest.way(row))}
+        if solved:
+            ways = label_ways(forest, solved, self._rng)
             walking = ways.right & possible_pushes(ways.boards) == 0
-            ways = ways.take(~walking | (self._rng.random(len(walking)) < self.config.walks))
-            self._ways.add(ways)
-            self._owed += self.config.reuse * len(ways.agent)
-        searched = [row for row in rows.tolist() if self._forest.expansions[row] > _LONG]
-        judged = [label_verdicts(self._forest, r, verdicts[r], self.config.verdicts, self._rng) for r in searched]
+            lessons["way"].append(ways.take(~walking | (self._rng.random(len(walking)) < config.walks)))
+        searched = [row for row in verdicts if forest.expansions[row] > _LONG]
+        judged = [label_verdicts(forest, row, verdicts[row], config.verdicts, self._rng) for row in searched]
+        lessons["verdict"] += judged
+
+
+class LessonStore:
+    """The newest lessons of searches, as batches under random symmetries, blurred and with cells hidden."""
+
+    def __init__(self, config: SearchConfig, seed: int) -> None:
+        """Make room for lessons; `seed` chooses batches."""
+        self.config = config
+        self.buffers = {"way": SampleBuffer(config.buffer), "verdict": SampleBuffer(config.buffer)}
+        self._rng = np.random.default_rng([seed, 6])
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def add(self, experience: Experience) -> None:
+        """Keep what an actor delivered."""
+        for kind, buffer in self.buffers.items():
+            buffer.add(Samples._make(experience.arrays[f"{kind}.{name}"] for name in Samples._fields))
+
+    def sample(self) -> Batch:
+        """Return a batch."""
+        ways, verdicts, size = self.buffers["way"], self.buffers["verdict"], self.config.batch_size
+        judged = int(size * self.config.judged) if verdicts.size > size else 0
+        parts = [ways.draw(size - judged, self._rng)]
         if judged:
-            self._verdicts.add(concatenate(judged))
+            parts.append(verdicts.draw(judged, self._rng))
+        batch = make_batch(concatenate(parts), self._rng.integers(0, SYMMETRIES, size))
+        state = blur(batch.state, self.config.noise, self._generator)
+        return batch._replace(state=hide_unseen(state, self.config.hidden, self._rng))
+
+    def state(self) -> State:
+        """Return the lessons and the random states."""
+        own = State({"rng": self._rng.bit_generator.state}, {"generator": self._generator.get_state()})
+        return State.of({"own": own} | {kind: buffer.state() for kind, buffer in self.buffers.items()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        own = state.part("own")
+        self._rng.bit_generator.state = own.values["rng"]
+        self._generator.set_state(own.tensors["generator"])
+        for kind, buffer in self.buffers.items():
+            buffer.restore(state.part(kind))
 
 
 def label_ways(forest: Forest, verdicts: Mapping[int, Verdicts], rng: np.random.Generator) -> Samples:

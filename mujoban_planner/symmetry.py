@@ -39,7 +39,7 @@ def average_instructions(values: Tensor, symmetries: Tensor) -> Tensor:
 def average_pushes(values: Tensor, symmetries: Tensor) -> Tensor:
     """Return the mean over views, [B, D, I, I], of values of the push of each cell's box in each direction."""
     directions, size = values.shape[1:3]
-    images = _push_images(size).to(values.device)[symmetries]
+    images = push_images(size).to(values.device)[symmetries]
     flat = values.reshape(*symmetries.shape, -1)
     return flat.take_along_dim(images, 2).mean(1).view(-1, directions, size, size)
 
@@ -57,7 +57,7 @@ def _instruction_images() -> Tensor:
 
 
 @lru_cache
-def _push_images(size: int) -> Tensor:
+def push_images(size: int) -> Tensor:
     """Return where the push of each cell's box in each direction stands in each view, int64 [8, D * size**2]."""
     images = np.argsort(cell_sources(size), axis=1)  # Shape [8, size * size]
     directions = np.array([instruction_map(s)[1:] for s in range(SYMMETRIES)]) - 1  # Shape [8, D]

@@ -13,6 +13,8 @@ import tyro
 from mujoban_planner import load
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.imitation import ImitationConfig, imitation
+from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
+from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
 from mujoban_planner.reinforcement import MPOConfig, reinforcement
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
@@ -101,18 +103,76 @@ class ExpertIteration:
     """Seconds between checkpoints."""
     threads: int = 1
     """Threads of the network."""
+    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
+    """Where searches run."""
     config: tyro.conf.OmitArgPrefixes[ExpertIterationConfig] = field(default_factory=ExpertIterationConfig)
 
     def main(self) -> None:
         """Train."""
         torch.set_num_threads(self.threads)
         cadence = Cadence(evaluate_seconds=self.evaluate_every, save_seconds=self.save_every)
-        expert_iteration(self.config, self.run, cadence).run(limit_seconds=self.seconds)
+        expert_iteration(self.config, self.run, cadence, self.actors).run(limit_seconds=self.seconds)
+
+
+@dataclass(frozen=True)
+class PPO:
+    """Proximal policy optimisation over pushes."""
+
+    run: Path = Path("runs/planner_ppo")
+    """Run directory; an existing one is resumed."""
+    seconds: float | None = None
+    """Stop after so many seconds; a later call resumes."""
+    evaluate_every: float = 300.0
+    """Seconds between evaluations on held-out levels."""
+    save_every: float = 120.0
+    """Seconds between checkpoints."""
+    threads: int = 1
+    """Threads of the network."""
+    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
+    """Where levels are played."""
+    config: tyro.conf.OmitArgPrefixes[PushPPOConfig] = field(default_factory=PushPPOConfig)
+
+    def main(self) -> None:
+        """Train."""
+        torch.set_num_threads(self.threads)
+        cadence = Cadence(evaluate_seconds=self.evaluate_every, save_seconds=self.save_every, publish_updates=1)
+        push_ppo(self.config, self.run, cadence, self.actors).run(limit_seconds=self.seconds)
+
+
+@dataclass(frozen=True)
+class MPOPushes:
+    """Maximum a posteriori policy optimisation over pushes."""
+
+    run: Path = Path("runs/planner_mpo_pushes")
+    """Run directory; an existing one is resumed."""
+    seconds: float | None = None
+    """Stop after so many seconds; a later call resumes."""
+    evaluate_every: float = 300.0
+    """Seconds between evaluations on held-out levels."""
+    save_every: float = 120.0
+    """Seconds between checkpoints."""
+    threads: int = 1
+    """Threads of the network."""
+    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
+    """Where levels are played."""
+    config: tyro.conf.OmitArgPrefixes[PushMPOConfig] = field(default_factory=PushMPOConfig)
+
+    def main(self) -> None:
+        """Train."""
+        torch.set_num_threads(self.threads)
+        cadence = Cadence(evaluate_seconds=self.evaluate_every, save_seconds=self.save_every)
+        push_mpo(self.config, self.run, cadence, self.actors).run(limit_seconds=self.seconds)
 
 
 def main() -> None:
     """Run the command line."""
-    commands = {"imitation": Imitation, "expert-iteration": ExpertIteration, "mpo": MPO}
+    commands = {
+        "imitation": Imitation,
+        "expert-iteration": ExpertIteration,
+        "ppo": PPO,
+        "mpo": MPO,
+        "mpo-pushes": MPOPushes,
+    }
     command = tyro.extras.subcommand_cli_from_dict(commands)
     try:
         command.main()

@@ -109,7 +109,8 @@ class TrainingLevels:
     def state(self) -> State:
         """Return all that changes."""
         rates = {"solved": self._solved.tolist(), "tried": self._tried.tolist()}
-        return State({"next": self._next, "rng": self._rng.bit_generator.state, "failed": self._failed, **rates})
+        failed = [list(ticket) for ticket in self._failed]
+        return State({"next": self._next, "rng": self._rng.bit_generator.state, "failed": failed, **rates})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""

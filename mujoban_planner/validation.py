@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final, Literal
 
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
-from mujoban_sokoban.generator import TEST_SEEDS, generate_batch
+from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_batch
 from mujoban_sokoban.levels import LevelBatch
 
 _FIRST_SEED: Final = 9_000_000
@@ -45,6 +45,11 @@ class NetworkConfig:
     judge: bool = True
     """Judge each push where the box is (with propagation)."""
 
+    @property
+    def network(self) -> NetworkConfig:
+        """The network alone."""
+        return NetworkConfig(**{f.name: getattr(self, f.name) for f in fields(NetworkConfig)})
+
     def build(self) -> LearnedPlanner:
         """Return a new network."""
         if self.architecture == "recurrent":
@@ -55,7 +60,7 @@ class NetworkConfig:
 def validation_levels(difficulty: int, n: int) -> LevelBatch:
     """Return `n` held-out levels."""
     seeds = range(_FIRST_SEED, _FIRST_SEED + n)
-    assert seeds[0] in TEST_SEEDS and seeds[-1] in TEST_SEEDS
+    assert seeds[0] in VALIDATION_SEEDS and seeds[-1] in VALIDATION_SEEDS
     return generate_batch(difficulty, seeds)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,12 +10,11 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as dump_tensors
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from mujoban_core.files import write_atomically
-from mujoban_rl.weights import check_finite
+from mujoban_core.files import replacing, write_atomically
+from mujoban_rl.weights import check_finite, digest
 
 
 class RunError(ValueError):
@@ -99,20 +97,16 @@ class RunDirectory:
             moments, scalars[name] = _split_optimiser(optimiser.state_dict())
             flat |= {f"optimiser/{name}/{k}": v for k, v in moments.items()}
         flat |= {f"tensor/{k}": v for k, v in (tensors or {}).items()}
-        # clone: safetensors refuses tensors that share storage
-        flat = {k: v.detach().cpu().contiguous().clone() for k, v in flat.items()}
+        flat = _separate(flat)
         check_finite(flat, f"checkpoint at step {step}")
-        data = dump_tensors(flat)
-        content = {
-            "step": step,
-            "digest": hashlib.sha256(data).hexdigest(),
-            "optimisers": scalars,
-            "extra": dict(extra or {}),
-        }
-        text = json.dumps(content, allow_nan=False)
+        content: dict[str, Any] = {"step": step, "optimisers": scalars, "extra": dict(extra or {})}
+        json.dumps(content, allow_nan=False)  # before anything is written
         path = self.path / f"checkpoint-{step:010d}.safetensors"
-        write_atomically(path, data)
-        write_atomically(path.with_suffix(".json"), text.encode())
+        # Into a file and not into memory: a replay may take up most of that.
+        with replacing(path) as temporary:
+            save_file(flat, temporary)
+            content["digest"] = digest(temporary)
+        write_atomically(path.with_suffix(".json"), json.dumps(content).encode())
         for old in self._checkpoints()[self.keep :]:
             old.unlink(missing_ok=True)
             old.with_suffix(".json").unlink(missing_ok=True)
@@ -154,12 +148,21 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | N
     """Return the JSON and tensor parts of a checkpoint, or None when it is damaged."""
     try:
         content = json.loads(path.with_suffix(".json").read_text())
-        data = path.read_bytes()
-        if hashlib.sha256(data).hexdigest() != content["digest"]:
-            return None
-        return content, load_tensors(data)
+        return (content, load_file(path)) if digest(path) == content["digest"] else None
     except (OSError, json.JSONDecodeError, KeyError, SafetensorError):
         return None
+
+
+def _separate(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return tensors on the CPU of which no two share memory, as safetensors demands; copies are made only for that."""
+    found: dict[str, Tensor] = {}
+    taken: set[int] = set()
+    for name, tensor in tensors.items():
+        own = tensor.detach().cpu().contiguous()
+        own = own.clone() if own.untyped_storage().data_ptr() in taken else own
+        taken.add(own.untyped_storage().data_ptr())
+        found[name] = own
+    return found
 
 
 def _below(flat: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

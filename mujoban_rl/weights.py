@@ -38,7 +38,8 @@ class WeightsError(ValueError):
 
 def digest(path: str | Path) -> str:
     """Return the SHA-256 of a file in hexadecimal."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def record_path(path: str | Path) -> Path:

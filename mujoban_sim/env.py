@@ -126,7 +126,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     ## Starting state
     Robot and boxes stand at the centres of their cells; the robot's heading is uniform. ``reset(seed=s)`` plays
     episode s: the level generated from s (or number s modulo the count of a level file), with the heading and the
-    appearance of s. ``reset()`` draws a seed, never one of the test levels below 10,000,000.
+    appearance of s. ``reset()`` draws a seed, never one of those below 10,000,000 for validation and tests.
     ``reset(options={"level": level})`` plays a given `mujoban_sokoban.levels.Level`, or a level text.
 
     ## Episode end

@@ -24,7 +24,15 @@ from mujoban_core.interfaces import (
     Termination,
     TerminationInput,
 )
-from mujoban_sim.driving import SteeringGains, forward_speed, limit_speed, plot_course, roll_and_steer
+from mujoban_sim.driving import (
+    SteeringGains,
+    forward_speed,
+    limit_speed,
+    plot_course,
+    push_speed,
+    roll_and_steer,
+    touches,
+)
 from mujoban_sim.goals import GoalKind, GoalTracker
 from mujoban_sokoban.rules import apply
 from mujoban_sokoban.solver import MAX_NODES, Status, solve
@@ -155,7 +163,6 @@ class DrivingGains(SteeringGains):
     """Gains of the oracle; lengths in cells, speeds in cells per second, angles in radians."""
 
     move_speed: float = 1.5
-    push_speed: float = 1.0
     braking: float = 3.0
     """Speed per cell of distance left."""
     lane_gain: float = 1.5
@@ -215,9 +222,13 @@ def drive(goals: GoalTracker, truth: GroundTruth, gains: DrivingGains) -> NDArra
     course = plot_course(goals.robot_target, pose, lane, g.lane_gain, g, size)
     box = truth.box_position[np.arange(len(pose)), goals.box_index]
     box_left = ((goals.box_target - box) / size * lane).sum(-1)
-    left = np.where(course.recentre, course.off_lane, np.maximum(np.where(push, box_left, course.along), 0.0))
-    speed = limit_speed(g.braking * left, np.where(push, g.push_speed, g.move_speed), course, g)
-    return roll_and_steer(speed, course.error, forward_speed(pose, velocity, size), velocity[:, 2], g)
+    ahead = forward_speed(pose, velocity, size)
+    pushing = push & ~course.recentre
+    left = np.where(course.recentre, course.off_lane, np.maximum(course.along, 0.0))
+    wanted = np.where(pushing, push_speed(box_left, ahead, g), g.braking * left)
+    speed = limit_speed(wanted, g.move_speed, course, g)
+    pushing &= touches(pose, box, lane, g, size)
+    return roll_and_steer(speed, course.error, pushing, ahead, velocity[:, 2], g)
 
 
 def _with_absent(box_position: NDArray[np.float32], count: int) -> NDArray[np.float32]:

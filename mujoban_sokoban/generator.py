@@ -23,10 +23,26 @@ from mujoban_core.grid import DIFFICULTIES, GRID_SIZE, OFFSETS_RC
 from mujoban_sokoban.bitboard import NONE, SIDE, SQUARES, Bits, Int, bit, count, flood, lowest, shift
 from mujoban_sokoban.levels import Level, LevelBatch
 
-TEST_SEEDS: Final = range(0, 10_000_000)
-"""Seeds of what users play and of every evaluation."""
+TEST_SEEDS: Final = range(0, 5_000_000)
+"""Seeds of results, and of what users play. Nothing is tuned on them, and each evaluation on them is logged."""
+VALIDATION_SEEDS: Final = range(5_000_000, 10_000_000)
+"""Seeds for tuning: to be looked at as often as one likes."""
 TRAIN_SEEDS: Final = range(10_000_000, 2**62)
 """Seeds of training."""
+
+
+def seed_range(first: int, count: int = 1) -> str:
+    """Return the range in which seeds from `first` on lie: test, validation or training.
+
+    Raises:
+        ValueError: if they do not all lie in one.
+    """
+    ranges = {"test": TEST_SEEDS, "validation": VALIDATION_SEEDS, "training": TRAIN_SEEDS}
+    for name, seeds in ranges.items():
+        if first in seeds and first + count - 1 in seeds:
+            return name
+    within = "; ".join(f"{name} {seeds.start} to {seeds.stop - 1}" for name, seeds in ranges.items())
+    raise ValueError(f"seeds {first} to {first + count - 1}: expected all in one range ({within})")
 
 # Carving patterns, the walker in the middle; those of Racaniere et al. as published in gym-sokoban.
 _PATTERNS: Final = np.array(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.paper import curves, figures, film, tables
-from benchmarks.paper.runs import CONFIGURATIONS, DIFFICULTY, RESULTS, SEED, ResultError, Run, is_stale
+from benchmarks.paper.runs import ALL, CONFIGURATIONS, DIFFICULTY, RESULTS, SEED, ResultError, Run, is_stale
 from mujoban_sim.rendering import RenderingError
 
 INTRODUCTION = f"""# Results
@@ -42,6 +42,7 @@ def main(folder: Path = RESULTS) -> int:
             tables.failures(CONFIGURATIONS),
             "## Figure 2: success against difficulty\n",
             tables.configurations(DIFFICULTY),
+            tables.test_uses(ALL),
             *_figure_2(DIFFICULTY, folder),
             "## Figure 3: an episode\n",
             *_figure_3(folder),

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.paper.runs import ROOT, SEED, Options, Run, is_stale
-from bringup.results import EpisodeResult, Failure, report, write_report
+from bringup.results import EpisodeResult, Failure, report, use_of_test_levels, write_report
 
 PARTS: Final = ROOT / "runs" / "paper"
 """Where parts lie until their evaluation is whole."""
@@ -97,7 +97,10 @@ def _join(parts: list[Part]) -> dict[str, Any]:
     if None in reports or len(weights) != 1:
         raise ValueError(f"{parts[0].run.name}: the weights changed while it ran; the same command goes on")
     episodes = [_episode(entry) for content in reports if content is not None for entry in content["episodes"]]
-    return report(episodes, json.loads(weights.pop()))
+    joined = report(episodes, json.loads(weights.pop()))
+    # The parts are one use of the test levels together.
+    commits = {use["commit"] for content in reports if content for use in content.get("test_uses", [])}
+    return {**joined, "test_uses": [use_of_test_levels(joined, ", ".join(sorted(map(str, commits))))]}
 
 
 def _episode(entry: dict[str, Any]) -> EpisodeResult:

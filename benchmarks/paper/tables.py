@@ -32,6 +32,15 @@ def failures(runs: Sequence[Run]) -> str:
     return _table(["configuration", *reasons], rows)
 
 
+def test_uses(runs: Sequence[Run]) -> str:
+    """Return how often the test levels were used for these rows, as their JSON has it."""
+    uses = [report.get("test_uses") for report in map(load, runs) if report]
+    counted = sum(len(entries) for entries in uses if entries)
+    unknown = sum(entries is None for entries in uses)
+    before = f"; {unknown} of the rows were measured before uses were counted" if unknown else ""
+    return f"The test levels were used {counted} times for these rows{before}.\n"
+
+
 def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
     name, oracles = f"`{run.name}`", ", ".join(run.oracle) or "none"
     paper = [MISSING if run.paper_success is None else f"{100 * run.paper_success:.1f} %"]

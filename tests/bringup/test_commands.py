@@ -56,11 +56,22 @@ def test_run_stack_shows_instruction_estimate_and_truth(capfd):
     assert "instruction" in out and "estimate" in out and "ground truth" in out and "solved 1 of 1" in out
 
 
+def test_every_use_of_the_test_levels_is_kept_in_the_report(tmp_path):
+    path = tmp_path / "report.json"
+    for seed in (1000, 1001):
+        options = ("--difficulty", 1, "--episodes", 2, "--seed", seed, "--time-limit", 3)
+        assert run(evaluate, *options, *ALL_ORACLES, "--json", path) == 0
+    uses = json.loads(path.read_text())["test_uses"]
+    assert [use["seeds"] for use in uses] == [[1000, 1001], [1001, 1002]]
+    assert all(use["weights"]["planner"] == "oracle" and "commit" in use for use in uses)
+
+
 def test_evaluate_gives_the_same_in_process_and_through_the_graph(tmp_path):
     reports = []
     for extra in ([], ["--graph"]):
         path = tmp_path / f"out{len(extra)}.json"
         assert run(evaluate, "--difficulty", 1, "--episodes", 2, *ALL_ORACLES, "--json", path, *extra) == 0
+        assert "test_uses" not in json.loads(path.read_text())
         reports.append(json.loads(path.read_text()))
     assert reports[0]["episodes"] == reports[1]["episodes"]
 

@@ -10,8 +10,9 @@ from mujoban_planner.forest import Forest
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.samples import Samples
 from mujoban_planner.search import grow
-from mujoban_planner.search_lessons import SearchConfig, SearchLessons
+from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
 from mujoban_planner.training_levels import TrainingLevels
+from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Cadence
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_sokoban.bitboard import SQUARE_STEP
@@ -19,17 +20,18 @@ from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 from mujoban_sokoban.levels import Level, stack_levels
 from mujoban_sokoban.solver import Status, solve_batch
 
-SMALL = SearchConfig(trees=16, expansions=20, buffer=4000)
+NETWORK = NetworkConfig(channels=8, blocks=1)
+SMALL = SearchConfig(trees=16, expansions=20, buffer=4000, steps=16, batch_size=32, noise=0.1, hidden=0.2)
 
 
 @pytest.fixture(scope="module")
 def lessons():
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    lessons = SearchLessons(ResidualPlanner(8, 1, judge=True), SMALL, batch_size=64, seed=0)
-    for _ in range(4):
-        lessons.next_batch()
-    return lessons
+    actor, store = SearchActor(NETWORK, SMALL, 0), LessonStore(SMALL, 0)
+    for _ in range(8):
+        store.add(actor.act())
+    return {kind: buffer.storage.take(np.arange(min(buffer.size, 400))) for kind, buffer in store.buffers.items()}
 
 
 def judged_pushes(samples: Samples):
@@ -40,8 +42,7 @@ def judged_pushes(samples: Samples):
 
 
 def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
-    ways, off_way = (part.storage.take(np.arange(min(part.size, 400))) for part in (lessons._ways, lessons._verdicts))
-    for samples, both in ((ways, True), (off_way, False)):
+    for samples, both in ((lessons["way"], True), (lessons["verdict"], False)):
         state, direction, square, deadly = judged_pushes(samples)
         one = np.uint64(1)
         box = samples.box[state] ^ (one << square.astype(np.uint64))
@@ -53,7 +54,7 @@ def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
 
 
 def test_ways_lead_to_the_solution_in_the_moves_that_their_values_count(lessons):
-    ways = lessons._ways.storage.take(np.arange(lessons._ways.size))
+    ways = lessons["way"]
     solved = solve_batch(level_batch(ways.boards))
     assert (solved.status == Status.SOLVED).all()
     last = np.isclose(ways.value, 10.99)  # the last box goes home in the next instruction
@@ -96,9 +97,14 @@ def test_levels_that_were_not_solved_come_again_and_the_mix_follows_what_is_solv
         TrainingLevels(-1)
 
 
-def run(path, **options):
+def run(path):
     config = ExpertIterationConfig(
-        channels=8, blocks=1, search=SMALL, batch_size=32, cpu_seconds=1e9, updates=8, noise=0.1, hidden=0.2, **options
+        channels=8,
+        blocks=1,
+        search=SMALL,
+        first_evaluations=1024,
+        cpu_seconds=1e9,
+        updates=8,
     )
     trainer = expert_iteration(config, path, Cadence(publish_updates=2, save_seconds=math.inf))
     trainer.learner.evaluate = dict

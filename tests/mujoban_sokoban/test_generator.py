@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mujoban_core.grid import DIFFICULTIES, GRID_SIZE, OFFSETS_RC
-from mujoban_sokoban.generator import TEST_SEEDS, TRAIN_SEEDS, generate_batch, generate_level, generate_levels
+from mujoban_sokoban.generator import (
+    TEST_SEEDS,
+    TRAIN_SEEDS,
+    VALIDATION_SEEDS,
+    generate_batch,
+    generate_level,
+    generate_levels,
+    seed_range,
+)
 from mujoban_sokoban.levels import stack_levels
 from mujoban_sokoban.solver import Status, solve_batch
 
@@ -70,7 +78,10 @@ def test_seeds_give_different_levels():
 
 
 def test_train_and_test_seeds_are_apart():
-    assert TEST_SEEDS[-1] < TRAIN_SEEDS[0]
+    assert TEST_SEEDS[0] == 0 and TEST_SEEDS[-1] < VALIDATION_SEEDS[0] and VALIDATION_SEEDS[-1] < TRAIN_SEEDS[0]
+    assert [seed_range(s) for s in (1000, VALIDATION_SEEDS[-1], TRAIN_SEEDS[0])] == ["test", "validation", "training"]
+    with pytest.raises(ValueError, match=r"4999999 to 5000000: expected all in one range"):
+        seed_range(TEST_SEEDS[-1], 2)
     assert not set(generate_levels(5, TEST_SEEDS[:300])) & set(generate_levels(5, TRAIN_SEEDS[:300]))
 
 

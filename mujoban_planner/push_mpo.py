@@ -1,0 +1,210 @@
+"""MPO over pushes, on the engine: the paper's method (C.2) with options for moves.
+
+n-step returns off-policy from a replay train the critic, discrete MPO the push head.
+
+Shapes: B batch, n steps of a return, E levels, A = 256 pushes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mujoban_planner.boards import BitBoards, signed
+from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
+from mujoban_planner.push_policy import PushPolicy, images
+from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
+from mujoban_planner.symmetry import SYMMETRIES
+from mujoban_planner.validation import solve_rates
+from mujoban_rl.actors import ActorOptions, ActorSource, Experience
+from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
+from mujoban_rl.limits import NaNGuard
+from mujoban_rl.losses.mpo import scalars
+from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
+from mujoban_rl.losses.returns import windowed_returns
+from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
+from mujoban_rl.replay import TimeMajorReplay
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.weights import save_weights
+
+Window = dict[str, Tensor]
+"""Successive steps from the replay, [B, n + 1] each."""
+
+
+@dataclass(frozen=True)
+class PushMPOConfig(PushRunConfig):
+    """What defines a run of MPO over pushes."""
+
+    play: PlayConfig = field(default_factory=lambda: PlayConfig(environments=128))
+    mpo: DiscreteMPOConfig = field(
+        default_factory=lambda: DiscreteMPOConfig(epsilon_policy=0.01, initial_temperature=0.3, initial_alpha=1.0)
+    )
+    batch_size: int = 512
+    reuse: float = 3.0
+    """Samples that are learned from per push that is played."""
+    replay_steps: int = 400
+    """Pushes in each level that are kept."""
+    first_steps: int = 5120
+    """Pushes before the first update."""
+    n_step: int = 5
+    discount: float = 0.97
+    """Per push."""
+    q_weight: float = 5.0
+    """Weight of the critic's loss."""
+    average: float = 0.99
+    """Share of the target network that an update leaves; it is what is shipped."""
+    learning_rate: float = 1e-3
+    dual_learning_rate: float = 1e-2
+    warm_up: float = 0.01
+    """Share of the budget in which the learning rate rises."""
+
+
+class PushMPOLearner(Learner[Window]):
+    """Learns from windows of the replay, each under a random symmetry."""
+
+    def __init__(self, config: PushMPOConfig) -> None:
+        """Build a policy, or start from a planner's weights."""
+        self.config = config
+        self.policy = starting_policy(config)
+        self._average = moving_average(self.policy, config.average, warm_up=True)
+        self.mpo = DiscreteMPO(config.mpo)
+        self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5)
+        self._dual_adam = self.mpo.duals.adam(config.dual_learning_rate)
+        self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up))
+        self._rng = np.random.default_rng([config.seed, 8])
+
+    @property
+    def target(self) -> PushPolicy:
+        """The averaged policy with its critic."""
+        assert isinstance(self._average.module, PushPolicy)
+        return self._average.module
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """Policy, target and dual variables."""
+        return {"policy": self.policy, "target": self._average, "mpo": self.mpo}
+
+    @property
+    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """Those of the networks and of the dual variables."""
+        return {"adam": self._adam, "duals": self._dual_adam}
+
+    def state(self) -> State:
+        """Return the random state."""
+        return State({"rng": self._rng.bit_generator.state})
+
+    def restore(self, state: State) -> None:
+        """Take over the random state."""
+        self._rng.bit_generator.state = state.values["rng"]
+
+    def update(self, batch: Window, progress: float, guard: NaNGuard) -> Scalars:
+        """Take a step of policy, critic and dual variables."""
+        config = self.config
+        self._schedule.follow(progress)
+        over = batch["over"][:, :-1]
+        returns = windowed_returns(batch["reward"][:, :-1], over, torch.zeros_like(over), config.discount)
+        rows = torch.arange(len(over))
+        symmetry = self._rng.integers(0, SYMMETRIES, len(over))
+        first, last = (_boards(batch, rows, at) for at in (torch.zeros_like(rows), returns.index))
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+            before, after = self.target(first, symmetry), self.target(last, symmetry)
+        goal = returns.reward + returns.bootstrap * expected_value(after.q, after.logits)
+        with torch.autocast("cpu", torch.bfloat16):
+            output = self.policy(first, symmetry)
+        policy_loss, stats = self.mpo(output.logits, before.logits, before.q)
+        taken = output.q.gather(1, images(batch["push"][:, 0].numpy(), symmetry)[:, None])[:, 0]
+        q_loss = functional.smooth_l1_loss(taken, goal)
+        loss = policy_loss + config.q_weight * q_loss
+        if guarded_step(loss, [self._adam, self._dual_adam], guard, clip=5.0) is not None:
+            self._average.update_parameters(self.policy)
+        return scalars(stats._asdict()) | {"q_loss": float(q_loss.detach()), "mean_return": float(goal.mean())}
+
+    def weights(self) -> Mapping[str, Tensor]:
+        """Return the policy's weights."""
+        return self.policy.state_dict()
+
+    def evaluate(self) -> Scalars:
+        """Return the averaged planner's solve rates, alone, on held-out levels."""
+        return solve_rates(self.target.planner, reduced_precision=True)
+
+    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
+        """Write the averaged planner's weights with their record."""
+        planner = self.target.planner
+        save_weights(directory.path / "planner.safetensors", planner, planner.config, record)
+
+
+def _boards(batch: Window, rows: Tensor, at: Tensor) -> BitBoards:
+    """Return the states at places `at`, [B], of windows."""
+    wall, target, box, agent = (batch[name][rows, at].numpy() for name in BOARDS)
+    return BitBoards(wall.view(np.uint64), target.view(np.uint64), box.view(np.uint64), agent)
+
+
+class PushReplay:
+    """The newest pushes of all actors."""
+
+    def __init__(self, config: PushMPOConfig, actors: int) -> None:
+        """Make room for the levels of so many actors."""
+        self.config = config
+        boards = dict.fromkeys(BOARDS, ((), torch.int64)) | {"agent": ((), torch.uint8)}
+        others = {"push": ((), torch.int64), "reward": ((), torch.float32), "over": ((), torch.bool)}
+        self._rings = [
+            TimeMajorReplay(config.replay_steps, config.play.environments, boards | others) for _ in range(actors)
+        ]
+        self._generator = torch.Generator().manual_seed(config.seed)
+
+    def add(self, experience: Experience) -> None:
+        """Keep what an actor delivered."""
+        ring = self._rings[experience.actor]
+        columns = {name: torch.from_numpy(signed(experience.arrays[name]).copy()) for name in ring.storage}
+        for step in range(self.config.play.steps):
+            ring.add({name: column[step] for name, column in columns.items()})
+
+    def sample(self) -> Window:
+        """Return windows of n + 1 successive steps."""
+        filled = [ring for ring in self._rings if len(ring) > self.config.n_step]
+        each = [len(part) for part in np.array_split(np.arange(self.config.batch_size), len(filled))]
+        parts = [r.sample(n, self.config.n_step, self._generator) for r, n in zip(filled, each, strict=True)]
+        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+    def state(self) -> State:
+        """Return all pushes and the random state."""
+        tensors = {f"{i}.{k}": v[: len(ring)] for i, ring in enumerate(self._rings) for k, v in ring.storage.items()}
+        added = [ring.added for ring in self._rings]
+        return State({"added": added}, tensors | {"generator": self._generator.get_state()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._generator.set_state(state.tensors["generator"])
+        for i, (ring, added) in enumerate(zip(self._rings, state.values["added"], strict=True)):
+            ring.added = added
+            for name, column in ring.storage.items():
+                column[: len(ring)] = state.tensors[f"{i}.{name}"]
+
+
+def push_mpo(
+    config: PushMPOConfig, directory: Path, cadence: Cadence, actors: ActorOptions | None = None
+) -> Trainer[Window]:
+    """Return the trainer of a run of MPO over pushes, resumed if there is one in the directory."""
+    options = actors or ActorOptions()
+    source = ActorSource(
+        options.pool(partial(PushActor, config.network, config.play)),
+        PushReplay(config, options.num_actors),
+        steps_per_update=config.batch_size / config.reuse,
+        first_steps=config.first_steps,
+    )
+    return Trainer(
+        RunDirectory(directory, config),
+        PushMPOLearner(config),
+        source,
+        config.budget,
+        cadence,
+        record=training_record("mpo over pushes", config),
+    )

@@ -1,0 +1,172 @@
+"""Proximal policy optimisation over pushes, on the engine.
+
+Shapes: T steps, E levels, M samples of a minibatch, A = 256 pushes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.distributions import Categorical
+
+from mujoban_planner.boards import BitBoards
+from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
+from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
+from mujoban_planner.validation import solve_rates
+from mujoban_rl.actors import ActorOptions, ActorSource, Arrays, Experience
+from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
+from mujoban_rl.limits import NaNGuard
+from mujoban_rl.losses.ppo import PPOConfig, generalised_advantages, ppo_loss
+from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_cosine
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.weights import save_weights
+
+
+@dataclass(frozen=True)
+class PushPPOConfig(PushRunConfig):
+    """What defines a run of PPO over pushes."""
+
+    play: PlayConfig = field(default_factory=PlayConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    epochs: int = 3
+    """Times that each rollout is learned from."""
+    minibatch: int = 512
+    discount: float = 0.97
+    """Per push."""
+    decay: float = 0.95
+    """lambda of generalised advantages."""
+    entropy: float = 0.01
+    """Weight of the policy's entropy."""
+    learning_rate: float = 1e-3
+    warm_up: float = 0.01
+    """Share of the budget in which the learning rate rises."""
+
+
+class PushPPOLearner(Learner[Arrays]):
+    """Learns from the rollouts of `PushActor`."""
+
+    def __init__(self, config: PushPPOConfig) -> None:
+        """Build a policy, or start from a planner's weights."""
+        self.config = config
+        self.policy = starting_policy(config)
+        self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5)
+        self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up))
+        self._rng = np.random.default_rng([config.seed, 7])
+
+    @property
+    def modules(self) -> Mapping[str, torch.nn.Module]:
+        """The policy with its critic."""
+        return {"policy": self.policy}
+
+    @property
+    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """Adam."""
+        return {"adam": self._adam}
+
+    def state(self) -> State:
+        """Return the random state."""
+        return State({"rng": self._rng.bit_generator.state})
+
+    def restore(self, state: State) -> None:
+        """Take over the random state."""
+        self._rng.bit_generator.state = state.values["rng"]
+
+    def update(self, batch: Arrays, progress: float, guard: NaNGuard) -> Scalars:
+        """Learn from a rollout for some epochs."""
+        config = self.config
+        self._schedule.follow(progress)
+        advantage, target = self._advantages(batch)
+        boards = BitBoards._make(batch[name].reshape(-1) for name in BOARDS)
+        push, old = (torch.from_numpy(batch[name].reshape(-1).copy()) for name in ("push", "log_prob"))
+        means: dict[str, list[float]] = {}
+        for _ in range(config.epochs):
+            order = self._rng.permutation(len(push))
+            for rows in np.array_split(order, max(1, len(push) // config.minibatch)):
+                states = BitBoards._make(column[rows] for column in boards)
+                with torch.autocast("cpu", torch.bfloat16):
+                    output = self.policy(states)
+                # What is not finite goes through, for the guard to see.
+                policy = Categorical(logits=output.logits, validate_args=False)
+                log_prob = policy.log_prob(push[rows])
+                loss, stats = ppo_loss(log_prob, old[rows], advantage[rows], output.value, target[rows], config.ppo)
+                entropy = policy.entropy().mean()
+                guarded_step(loss - config.entropy * entropy, [self._adam], guard, clip=1.0)
+                for name, value in {**stats, "entropy": entropy}.items():
+                    means.setdefault(name, []).append(float(value.detach()))
+        return {f"ppo/{name}": float(np.mean(values)) for name, values in means.items()}
+
+    def _advantages(self, batch: Arrays) -> tuple[Tensor, Tensor]:
+        """Return normalised advantages and targets of values, [T * E]."""
+        length, levels = batch["reward"].shape
+        boards = BitBoards._make(np.concatenate([batch[name], batch[f"last_{name}"][None]]).ravel() for name in BOARDS)
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+            value = self.policy(boards).value.view(length + 1, levels)
+        reward, over = (torch.from_numpy(batch[name].copy()) for name in ("reward", "over"))
+        discount = self.config.discount * (~over).float()
+        advantage, target = generalised_advantages(reward, discount, value[:-1], value[-1], self.config.decay)
+        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
+        return advantage.flatten(), target.flatten()
+
+    def weights(self) -> Mapping[str, Tensor]:
+        """Return the policy's weights."""
+        return self.policy.state_dict()
+
+    def evaluate(self) -> Scalars:
+        """Return the planner's solve rates, alone, on held-out levels."""
+        planner = self.policy.planner.eval()
+        rates = solve_rates(planner, reduced_precision=True)
+        planner.train()
+        return rates
+
+    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
+        """Write the planner's weights with their record."""
+        planner = self.policy.planner
+        save_weights(directory.path / "planner.safetensors", planner, planner.config, record)
+
+
+class Rollouts:
+    """Hands on what actors delivered, once."""
+
+    def __init__(self) -> None:
+        self._parts: list[Arrays] = []
+
+    def add(self, experience: Experience) -> None:
+        """Take the rollout of an actor."""
+        self._parts.append(experience.arrays)
+
+    def sample(self) -> Arrays:
+        """Return the rollouts of all actors since the last call, side by side."""
+        parts, self._parts = self._parts, []
+        return {name: np.concatenate([part[name] for part in parts], axis=-1) for name in parts[0]}
+
+    def state(self) -> State:
+        """Return nothing: between two updates there is nothing."""
+        return State()
+
+    def restore(self, state: State) -> None:
+        """Take over nothing."""
+
+
+def push_ppo(
+    config: PushPPOConfig, directory: Path, cadence: Cadence, actors: ActorOptions | None = None
+) -> Trainer[Arrays]:
+    """Return the trainer of a run of PPO over pushes, resumed if there is one in the directory."""
+    options = actors or ActorOptions()
+    pool = options.pool(partial(PushActor, config.network, config.play))
+    steps = config.play.steps * config.play.environments * options.num_actors
+    source = ActorSource(pool, Rollouts(), steps_per_update=steps)
+    return Trainer(
+        RunDirectory(directory, config),
+        PushPPOLearner(config),
+        source,
+        config.budget,
+        cadence,
+        record=training_record("ppo over pushes", config),
+    )

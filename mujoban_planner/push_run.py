@@ -1,0 +1,54 @@
+"""What runs of reinforcement learning over pushes have in common."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mujoban_planner.growth import start_from
+from mujoban_planner.push_policy import PushPolicy
+from mujoban_planner.validation import NetworkConfig
+from mujoban_rl.engine import Budget
+from mujoban_rl.weights import provenance
+
+
+@dataclass(frozen=True)
+class PushRunConfig(NetworkConfig):
+    """What defines a run, whatever the method."""
+
+    channels: int = 32
+    """Channels of the network."""
+    blocks: int = 4
+    """Residual blocks (residual)."""
+    init: str | None = None
+    """Weights to start from: of the same or fewer channels and blocks."""
+    cpu_seconds: float = 10_800.0
+    """CPU seconds after which the run is complete; the learning rate falls until then. Two cores have so many in 90
+    minutes."""
+    updates: float = 1e9
+    """Updates after which it is complete."""
+    seed: int = 0
+
+    @property
+    def budget(self) -> Budget:
+        """When the run is complete."""
+        return Budget(cpu_seconds=self.cpu_seconds, updates=self.updates)
+
+
+def starting_policy(config: PushRunConfig) -> PushPolicy:
+    """Return the policy that a run starts with."""
+    torch.manual_seed(config.seed)  # the initial weights
+    network = config.build()
+    if config.init is not None:
+        start_from(network, Path(config.init))
+    network.lay_out()
+    return PushPolicy(network, untaught=config.init is None)
+
+
+def training_record(method: str, config: PushRunConfig) -> dict[str, Any]:
+    """Return what the weights' record says of a run."""
+    data = "own play of generated levels, training seeds; no solver"
+    return {**provenance(), "method": method, "training": asdict(config), "data": data}

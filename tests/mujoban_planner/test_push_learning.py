@@ -1,0 +1,90 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mujoban_planner.boards import abstract_states, bit_boards
+from mujoban_planner.networks import ResidualPlanner
+from mujoban_planner.push_actor import PlayConfig
+from mujoban_planner.push_env import PUSHES
+from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
+from mujoban_planner.push_policy import PushPolicy, images
+from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
+from mujoban_rl.engine import Cadence
+from mujoban_rl.testing import check_refusal, check_resuming
+from mujoban_sokoban.generator import generate_batch
+
+PLAY = PlayConfig(environments=16, steps=4)
+SIZE = {"channels": 8, "blocks": 1, "cpu_seconds": 1e9, "updates": 6.0}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def ppo(path):
+    config = PushPPOConfig(play=PLAY, minibatch=32, **SIZE)
+    trainer = push_ppo(config, path, Cadence(publish_updates=1, save_seconds=math.inf))
+    trainer.learner.evaluate = dict
+    return trainer
+
+
+def mpo(path):
+    config = PushMPOConfig(play=PLAY, batch_size=32, first_steps=256, replay_steps=40, n_step=3, **SIZE)
+    trainer = push_mpo(config, path, Cadence(publish_updates=2, save_seconds=math.inf))
+    trainer.learner.evaluate = dict
+    return trainer
+
+
+@pytest.mark.parametrize("make", [ppo, mpo])
+def test_runs_resume_to_the_bit(make, tmp_path):
+    check_resuming(make, tmp_path, stop_at=3, updates=6)
+
+
+@pytest.mark.parametrize("make", [ppo, mpo])
+def test_a_batch_with_nan_teaches_nothing(make, tmp_path):
+    def poison(batch):
+        return {**batch, "reward": batch["reward"] * math.nan}
+
+    check_refusal(make(tmp_path), poison)
+
+
+@pytest.mark.parametrize("make", [ppo, mpo])
+def test_the_loss_teaches_the_push_head_and_the_trunk_but_no_other_head(make, tmp_path):
+    trainer = make(tmp_path)
+    planner = trainer.learner.policy.planner
+    before = {k: v.clone() for k, v in planner.state_dict().items()}
+    trainer.run()
+    names = [k for k, v in planner.state_dict().items() if not torch.equal(v, before[k])]
+    changed = {".".join(name.split(".")[:2]) for name in names}
+    assert {"readout.push", "encoder.weight"} <= changed
+    assert not {"readout.policy", "readout.dead", "readout.push_dead", "readout.walk", "readout.plan"} & changed
+
+
+def test_a_policy_over_pushes_is_that_of_the_planner_that_ships_under_every_symmetry():
+    torch.manual_seed(0)
+    planner = ResidualPlanner(8, 1, judge=True).eval()
+    policy = PushPolicy(planner, untaught=True).eval()
+    levels = generate_batch(4, range(8))
+    with torch.no_grad():
+        output = policy(bit_boards(levels))
+        advice = planner(torch.from_numpy(abstract_states(levels)))
+    chances = output.logits.softmax(1)
+    # The planner that ships gives a little to pushes that are not possible.
+    assert torch.allclose(chances, advice.push.exp().flatten(1), atol=0.05)
+    push = output.logits.argmax(1).numpy()
+    for s in range(8):
+        symmetry = np.full(8, s)
+        with torch.no_grad():
+            seen = policy(bit_boards(levels), symmetry)
+        at = images(push, symmetry)[:, None]
+        assert (seen.logits.gather(1, at) > -1e8).all()
+        assert ((seen.logits > -1e8).sum(1) == (output.logits > -1e8).sum(1)).all()
+    assert output.logits.shape == (8, PUSHES)
+
+
+def test_a_planner_whose_decisions_do_not_follow_pushes_is_refused():
+    with pytest.raises(ValueError, match="without propagation"):
+        PushPolicy(ResidualPlanner(8, 1, propagation=False), untaught=True)
