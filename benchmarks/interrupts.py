@@ -40,7 +40,7 @@ GIVE_UP: Final = 60.0
 """Seconds after which a command that does not end is killed."""
 _CPU_SECONDS: Final = (0.5, 15.0)
 """Of the command and its children, before the signal: all of start-up, and some of play."""
-_SHORT: Final = ("--episodes", "1000", "--seed", "1000")
+_SHORT: Final = ("--episodes", "1000")
 
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 MODES: Final[dict[str, tuple[str, ...]]] = {

@@ -192,6 +192,37 @@ def add_module_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_recording_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say what may be recorded; `recorded_seed` reads them."""
+    parser.set_defaults(seed=None)
+    parser.add_argument(
+        "--allow-test-seeds", action="store_true", help="record also levels that are kept for tests, not for training"
+    )
+
+
+def recorded_seed(seed: int | None, *, records: bool, allow_test_seeds: bool) -> int:
+    """Return the seed of the first episode: of those for training where it is recorded and nobody says otherwise.
+
+    Args:
+        seed: As given on the command line; None where it was not.
+        records: Whether the episodes are recorded.
+        allow_test_seeds: Whether they may be recorded though they are kept for tests.
+
+    Raises:
+        ValueError: If they are kept for tests and that is not allowed.
+    """
+    from mujoban_sokoban.generator import TEST_SEEDS, TRAIN_SEEDS
+
+    if seed is None:
+        return TRAIN_SEEDS.start if records else 0
+    if records and seed in TEST_SEEDS and not allow_test_seeds:
+        raise ValueError(
+            f"--seed {seed}: its levels are kept for tests; expected one from {TEST_SEEDS.stop} on for a recording, "
+            "or --allow-test-seeds"
+        )
+    return seed
+
+
 def episodes_from(arguments: argparse.Namespace) -> Episodes:
     """Return the episodes that the options ask for; say on stderr which levels of a file are unsolvable."""
     from mujoban_sokoban.episodes import Episodes

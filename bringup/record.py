@@ -24,8 +24,10 @@ from bringup.command import (
     Parser,
     Stack,
     add_module_options,
+    add_recording_options,
     add_world_option,
     import_from_here,
+    recorded_seed,
     run_command,
     stack_from,
 )
@@ -39,7 +41,7 @@ from mujoban_core.threads import set_threads
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec, LazyEpisodes, after_moves
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.generator import generate_level
 from mujoban_sokoban.solver import solve_level
 
 PROG = "record.py"
@@ -236,6 +238,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         raise ValueError(f"{arguments.out} is not empty: expected a new folder for the bags")
     if arguments.processes < 1 or arguments.batch < 1:
         raise ValueError(f"{arguments.processes} processes, batch {arguments.batch}: expected at least 1")
+    arguments.seed = recorded_seed(arguments.seed, records=True, allow_test_seeds=arguments.allow_test_seeds)
     jobs = [_job(arguments, part) for part in range(min(arguments.processes, arguments.episodes))]
     arguments.out.mkdir(parents=True, exist_ok=True)
     with working(jobs) as answers, Progress(console=Console(stderr=True)) as progress:
@@ -253,9 +256,8 @@ def _arguments(command_line: Sequence[str] | None) -> argparse.Namespace:
         "--difficulty", type=int, nargs="+", default=[1, 2, 3, 4, 5, 5, 5, 5],
         help="difficulties to draw from; one that is named twice comes twice as often",
     )  # fmt: skip
-    parser.add_argument(
-        "--seed", type=int, default=TRAIN_SEEDS.start, help="of the first episode; by default the first for training"
-    )
+    parser.add_argument("--seed", type=int, help="of the first episode; by default the first for training")
+    add_recording_options(parser)
     parser.add_argument("--advanced", type=float, default=0.5, help="share of episodes that begin along a solution")
     parser.add_argument("--time-limit", type=int, default=600, help="ticks of an episode; 0: those of the body")
     parser.add_argument("--batch", type=int, default=32, help="episodes at the same time in each process")

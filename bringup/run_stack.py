@@ -12,9 +12,11 @@ from bringup.command import (
     Parser,
     add_episode_options,
     add_module_options,
+    add_recording_options,
     episodes_from,
     import_from_here,
     positive,
+    recorded_seed,
     run_command,
     stack_from,
 )
@@ -39,6 +41,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--processes", action="store_true", help="run each node in a process of its own")
     parser.add_argument("--headless", action="store_true", help="show no live view")
     parser.add_argument("--record", type=Path, metavar="DIR", help="record all topics into a bag")
+    add_recording_options(parser)
     parser.add_argument("--episodes-per-file", type=positive, default=32, metavar="N", help="of the bag")
     parser.add_argument("--video", type=Path, metavar="FILE", help="write an .mp4 of the robot's view and from above")
     parser.add_argument("--view", action="store_true", help="serve a live view (Rerun) to the browser")
@@ -57,6 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = parse(arguments)
     import_from_here()
+    options.seed = recorded_seed(
+        options.seed, records=options.record is not None, allow_test_seeds=options.allow_test_seeds
+    )
     episodes, stack = episodes_from(options), stack_from(options)
 
     from rich.console import Console

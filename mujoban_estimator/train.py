@@ -18,7 +18,7 @@ from mujoban_estimator.bag_source import BagSource, Reading
 from mujoban_estimator.bag_stream import TOPICS
 from mujoban_estimator.data import Batch
 from mujoban_estimator.learner import EstimatorLearner, TrainConfig
-from mujoban_msgs_py.bags.training import find_bags, open_training_bag
+from mujoban_msgs_py.bags.training import find_bags, open_training_bag, require_training_seeds
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import provenance
@@ -65,7 +65,9 @@ def make_trainer(options: Options) -> Trainer[Batch]:
     torch.set_num_threads(options.threads)
     bags, validation = find_bags(options.bags), find_bags(options.validation)
     for path in (*bags, *validation):
-        open_training_bag(path, TOPICS, skip_damaged=options.skip_damaged)
+        bag = open_training_bag(path, TOPICS, skip_damaged=options.skip_damaged)
+        if path in bags and not options.allow_test_seeds:
+            require_training_seeds(bag)
     learner = EstimatorLearner(config, device=options.device, validation=validation, out=options.out)
     if options.start is not None:
         learner.start_from(options.start)

@@ -64,6 +64,27 @@ def open_training_bag(path: Path, wanted: Sequence[Topic], *, skip_damaged: bool
     return bag
 
 
+def require_training_seeds(bag: Bag) -> None:
+    """Refuse a bag that begins with an episode whose seed is kept for tests; recorders count seeds upwards.
+
+    It reads one message, so that it can be asked before anything else is started; `episode_ticks` looks at all.
+
+    Raises:
+        BagError: If it does, or is damaged.
+    """
+    for value in bag.read([topics.EPISODE.name]):
+        _require_training_seed(bag, value.value.seed)
+        return
+
+
+def _require_training_seed(bag: Bag, seed: int) -> None:
+    if seed not in TRAIN_SEEDS:
+        raise BagError(
+            f"{bag.path} holds an episode with seed {seed}, which is kept for tests: expected seeds from "
+            f"{TRAIN_SEEDS.start} on, which recorders use unless they are told otherwise"
+        )
+
+
 @dataclass
 class ReadReport:
     """What reading met with."""
@@ -110,11 +131,8 @@ def episode_ticks(
     number, following = None, 0
     for tick in bag.ticks(wanted, endings=endings):
         reading: EpisodeReading = tick.values[which]
-        if reading.seed not in TRAIN_SEEDS and not allow_test_seeds:
-            raise BagError(
-                f"{bag.path} holds an episode with seed {reading.seed}, which is kept for tests: expected seeds from "
-                f"{TRAIN_SEEDS.start} on"
-            )
+        if not allow_test_seeds:
+            _require_training_seed(bag, reading.seed)
         if reading.step == 0:
             number, following = reading.episode, 0
             report.episodes += 1

@@ -12,10 +12,13 @@ import imageio.v2 as imageio
 import pytest
 
 from bringup import evaluate, run_stack
-from bringup.command import exit_status
+from bringup.command import exit_status, recorded_seed
+from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import open_bag
+from mujoban_msgs_py.bags.training import episode_ticks, open_training_bag
 from mujoban_msgs_py.topics import GRAPH_TOPICS
 from mujoban_sim import rendering
+from mujoban_sokoban.generator import TRAIN_SEEDS
 from mujoban_sokoban.levels import Level, write_levels
 
 ALL_ORACLES = ["--oracle", "estimator,termination,planner,controller"]
@@ -36,15 +39,16 @@ def run(command, *arguments):
 def test_run_stack_plays_records_films_and_reports(tmp_path, capfd):
     report, bag, video = tmp_path / "out.json", tmp_path / "bag", tmp_path / "film.mp4"
     status = run(
-        run_stack, "--difficulty", 1, "--episodes", 2, "--seed", 1000, "--headless", *ALL_ORACLES,
+        run_stack, "--difficulty", 1, "--episodes", 2, "--headless", *ALL_ORACLES,
         "--json", report, "--record", bag, "--video", video,
     )  # fmt: skip
     assert status == 0
     content = json.loads(report.read_text())
-    assert content["success_rate"] == 1.0 and [e["seed"] for e in content["episodes"]] == [1000, 1001]
+    assert content["success_rate"] == 1.0 and [e["seed"] for e in content["episodes"]] == [*TRAIN_SEEDS[:2]]
     assert {"success_interval", "mean_return", "weights", "ticks_per_second"} <= content.keys()
     assert "solved 2 of 2" in capfd.readouterr().out
-    assert (bag / "metadata.yaml").is_file()
+    recorded = list(episode_ticks(open_training_bag(bag, [topics.EPISODE]), [topics.EPISODE]))
+    assert len(recorded) == sum(e["steps"] + 1 for e in content["episodes"]), "every tick may be learned from"
     film = imageio.get_reader(video).get_meta_data()
     assert film["codec"] == "h264" and film["pix_fmt"].startswith("yuv420p") and film["size"] == (768, 384)
     assert film["duration"] >= 0.05 * sum(e["steps"] for e in content["episodes"])
@@ -98,6 +102,7 @@ def test_an_unsolvable_level_is_played_and_said_to_be(tmp_path, capfd):
         (["--planner", "mujoban_sim.oracles:OracleController", *BUT_PLANNER], "Planner"),
         (["--realtime", "-2"], "-2"),
         (["--video", "film.avi", *ALL_ORACLES], "film.avi"),
+        (["--record", "bag", "--seed", "1000", *ALL_ORACLES], "--seed 1000: its levels are kept for tests"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_on_stderr_and_status_2(capfd, arguments, named):
@@ -168,3 +173,12 @@ def test_an_interrupted_recording_leaves_whole_bags_of_all_its_processes(tmp_pat
     process.communicate(timeout=60)
     assert process.returncode == 143
     assert len([message for bag in bags.iterdir() for message in open_bag(bag).messages()]) > 0
+
+
+def test_levels_that_are_kept_for_tests_are_recorded_only_when_that_is_asked_for():
+    assert recorded_seed(None, records=False, allow_test_seeds=False) == 0
+    assert recorded_seed(7, records=False, allow_test_seeds=False) == 7
+    assert recorded_seed(None, records=True, allow_test_seeds=False) in TRAIN_SEEDS
+    assert recorded_seed(7, records=True, allow_test_seeds=True) == 7
+    with pytest.raises(ValueError, match="--allow-test-seeds"):
+        recorded_seed(7, records=True, allow_test_seeds=False)
