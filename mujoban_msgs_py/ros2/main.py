@@ -13,7 +13,8 @@ from pathlib import Path
 from mujoban_core.signals import interrupt_status, interruptible
 
 USAGE_ERROR = 2
-FAMILIES = ("bag", "node", "param", "service", "topic")
+FAMILIES = ("bag", "interface", "node", "param", "service", "topic")
+PACKAGE = "mujoban_msgs"
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -30,11 +30,11 @@ def to_yaml(
         truncate: Elements of an array and letters of a string that are shown; None shows all.
         no_arr: Whether arrays are described instead of shown.
         no_str: Whether strings are described instead of shown.
-        flow_style: Whether arrays go on one line.
+        flow_style: Whether all of it goes on one line.
     """
     plain = _plain(message, "", truncate, no_arr, no_str)
     return yaml.safe_dump(
-        plain, sort_keys=False, allow_unicode=True, width=float("inf"), default_flow_style=None if flow_style else False
+        plain, sort_keys=False, allow_unicode=True, width=float("inf"), default_flow_style=flow_style
     )
 
 

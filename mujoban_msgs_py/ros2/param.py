@@ -1,4 +1,4 @@
-"""`ros2 param list|get|set`."""
+"""`ros2 param list|get|set|describe|dump`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from array import array
 from typing import Any, Final
 
 import yaml
-from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.msg import ParameterDescriptor, ParameterType
 from rclpy.parameter import Parameter, get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
@@ -28,6 +28,19 @@ _LABELS: Final = {
     ParameterType.PARAMETER_INTEGER_ARRAY: "Integer values are:",
     ParameterType.PARAMETER_DOUBLE_ARRAY: "Double values are:",
     ParameterType.PARAMETER_STRING_ARRAY: "String values are:",
+}
+
+
+_TYPE_NAMES: Final = {
+    ParameterType.PARAMETER_BOOL: "boolean",
+    ParameterType.PARAMETER_INTEGER: "integer",
+    ParameterType.PARAMETER_DOUBLE: "double",
+    ParameterType.PARAMETER_STRING: "string",
+    ParameterType.PARAMETER_BYTE_ARRAY: "byte array",
+    ParameterType.PARAMETER_BOOL_ARRAY: "boolean array",
+    ParameterType.PARAMETER_INTEGER_ARRAY: "integer array",
+    ParameterType.PARAMETER_DOUBLE_ARRAY: "double array",
+    ParameterType.PARAMETER_STRING_ARRAY: "string array",
 }
 
 
@@ -52,6 +65,66 @@ def add_verbs(commands: Any) -> None:
     parser.add_argument("value", help="Value of the parameter")
     add_discovery_options(parser)
     parser.set_defaults(run=set_parameter)
+    _add_looks(verbs)
+
+
+def _add_looks(verbs: Any) -> None:
+    parser = verbs.add_parser("describe", help="Show descriptive information about declared parameters")
+    parser.add_argument("node_name", help="Name of the ROS node")
+    parser.add_argument("parameter_names", nargs="+", help="Names of the parameters")
+    add_discovery_options(parser)
+    parser.set_defaults(run=describe)
+    parser = verbs.add_parser("dump", help="Show all of the parameters of a node in a YAML file format")
+    parser.add_argument("node_name", help="Name of the ROS node")
+    add_discovery_options(parser)
+    parser.set_defaults(run=dump)
+
+
+def describe(options: argparse.Namespace) -> int:
+    """Print type, description and constraints of parameters."""
+    with Session(options) as session:
+        find_node(session, options.node_name)
+        node = full_name(options.node_name)
+        answer = _answer(session, node, _client(session, node).describe_parameters(options.parameter_names))
+        for descriptor in answer.descriptors:
+            _print_descriptor(descriptor)
+    return 0
+
+
+def _print_descriptor(descriptor: ParameterDescriptor) -> None:
+    print("Parameter name:", descriptor.name)
+    print("  Type:", _TYPE_NAMES.get(descriptor.type, "not set"))
+    if descriptor.description:
+        print("  Description:", descriptor.description)
+    print("  Constraints:")
+    if descriptor.read_only:
+        print("    Read only: true")
+    for bounds in (*descriptor.floating_point_range, *descriptor.integer_range)[:1]:
+        print("    Min value:", bounds.from_value)
+        print("    Max value:", bounds.to_value)
+        if bounds.step:
+            print("    Step:", bounds.step)
+    if descriptor.additional_constraints:
+        print("    Additional constraints:", descriptor.additional_constraints)
+
+
+def dump(options: argparse.Namespace) -> int:
+    """Print the parameters of a node as a parameter file."""
+    with Session(options) as session:
+        find_node(session, options.node_name)
+        node = full_name(options.node_name)
+        names = _names(session, node)
+        answer = _answer(session, node, _client(session, node).get_parameters(names))
+        tree: dict[str, Any] = {}
+        for name, value in zip(names, answer.values, strict=True):
+            *groups, last = name.split(".")
+            branch = tree
+            for group in groups:
+                branch = branch.setdefault(group, {})
+            content = parameter_value_to_python(value)
+            branch[last] = content.tolist() if isinstance(content, array) else content
+        print(yaml.safe_dump({node: {"ros__parameters": tree}}, default_flow_style=False))
+    return 0
 
 
 def list_parameters(options: argparse.Namespace) -> int:
@@ -100,9 +173,9 @@ def set_parameter(options: argparse.Namespace) -> int:
         parameter = Parameter(options.parameter_name, value=parameter_value_to_python(value))
         answer = _answer(session, node, _client(session, node).set_parameters([parameter]))
         (result,) = answer.results
-        if not result.successful:
-            raise CommandError(f"Setting parameter failed: {result.reason}")
-        print("Set parameter successful" + (f": {result.reason}" if result.reason else ""))
+        said = "Set parameter successful" if result.successful else "Setting parameter failed"
+        # On stderr, and with status 0, as the genuine command has it.
+        print(said + (f": {result.reason}" if result.reason else ""), file=None if result.successful else sys.stderr)
     return 0
 
 

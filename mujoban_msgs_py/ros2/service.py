@@ -1,4 +1,4 @@
-"""`ros2 service list|call`."""
+"""`ros2 service list|type|call`."""
 
 from __future__ import annotations
 
@@ -33,6 +33,10 @@ def add_verbs(commands: Any) -> None:
     parser.add_argument("--include-hidden-services", action="store_true", help="Consider hidden services as well")
     add_discovery_options(parser)
     parser.set_defaults(run=list_services)
+    parser = verbs.add_parser("type", help="Output a service's type")
+    parser.add_argument("service_name", help="Name of the ROS service to get type (e.g. '/talker/list_parameters')")
+    add_discovery_options(parser)
+    parser.set_defaults(run=show_type)
 
 
 def list_services(options: argparse.Namespace) -> int:
@@ -46,6 +50,20 @@ def list_services(options: argparse.Namespace) -> int:
             for name, types in found:
                 print(f"{name} [{', '.join(types)}]" if options.show_types else name)
     return 0
+
+
+def show_type(options: argparse.Namespace) -> int:
+    """Print a service's type; without such a service, nothing and status 1, as the genuine command."""
+    name = full_name(options.service_name)
+    with Session(options) as session:
+
+        def types() -> list[str]:
+            return dict(session.node.get_service_names_and_types()).get(name, [])
+
+        session.until(lambda: bool(types()), session.limit)
+        for kind in types():
+            print(kind)
+        return 0 if types() else 1
 
 
 def call(options: argparse.Namespace) -> int:

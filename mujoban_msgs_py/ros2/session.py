@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import sys
 import time
 from collections.abc import Callable
 from types import TracebackType
@@ -83,18 +84,46 @@ class Session:
         if self._spin_time is not None:
             self.spin_for(self._spin_time)
             return graph()
-        end = time.monotonic() + DISCOVERY_LIMIT
+        patience = _patience()
+        end = time.monotonic() + DISCOVERY_LIMIT * patience
         seen, since = graph(), time.monotonic()
-        while time.monotonic() < end and (self._alone() or time.monotonic() < since + QUIET_TIME):
+        while time.monotonic() < end:
+            known = self._others_known()
+            if known and time.monotonic() >= since + QUIET_TIME * patience:
+                return seen
             self.spin_for(STEP)
             now = graph()
-            if now != seen:
+            if now != seen or not known:
                 seen, since = now, time.monotonic()
+        if self._others():
+            print(f"warning: still discovering after {DISCOVERY_LIMIT * patience:.0f} s: this may not be all of it; "
+                  "--spin-time looks longer", file=sys.stderr)  # fmt: skip
         return seen
 
-    def _alone(self) -> bool:
-        """Return whether no other node has been discovered yet."""
-        return all(name == self.node.get_name() for name in self.node.get_node_names())
+    @property
+    def limit(self) -> float:
+        """Seconds within which what exists has to be discovered."""
+        return DISCOVERY_LIMIT * _patience() if self._spin_time is None else self._spin_time
+
+    def _others(self) -> list[tuple[str, str]]:
+        """Return name and namespace of all other nodes that have been discovered."""
+        names = self.node.get_node_names_and_namespaces()
+        return [(name, namespace) for name, namespace in names if not name.startswith("_ros2cli_")]
+
+    def _others_known(self) -> bool:
+        """Return whether others have been discovered, and of each of them something that it publishes or serves.
+
+        A node's name arrives before its topics and services, and on a busy machine long before.
+        """
+        others = self._others()
+        try:
+            return bool(others) and all(
+                self.node.get_publisher_names_and_types_by_node(*other)
+                or self.node.get_service_names_and_types_by_node(*other)
+                for other in others
+            )
+        except RuntimeError:  # one of them has gone in between
+            return False
 
     def wait_for(self, found: Callable[[], bool], complaint: str) -> None:
         """Spin until something has been discovered.
@@ -102,8 +131,7 @@ class Session:
         Raises:
             CommandError: With `complaint` if it is not within the time for discovery.
         """
-        limit = DISCOVERY_LIMIT if self._spin_time is None else self._spin_time
-        if not self.until(found, limit):
+        if not self.until(found, self.limit):
             raise CommandError(complaint)
 
     def topic_type(self, topic: str, complaint: str | None = None) -> str:
@@ -116,6 +144,11 @@ class Session:
             lambda: topic in dict(self.node.get_topic_names_and_types()), complaint or f"unknown topic '{topic}'"
         )
         return dict(self.node.get_topic_names_and_types())[topic][0]
+
+
+def _patience() -> float:
+    """Return by how much all takes longer on a machine that has more to do than it has cores, at most 6."""
+    return min(6.0, max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1)))
 
 
 def full_name(name: str) -> str:
