@@ -11,16 +11,20 @@ HERE = Path(__file__).resolve().parent
 PACKAGES = ("mujoban_*", "bringup*", "benchmarks*")
 
 sys.path.insert(0, str(HERE / "mujoban_msgs_py"))
-from interface_build import PACKAGE, extension  # noqa: E402  # pyright: ignore[reportMissingImports]
+from interface_build import PACKAGE, ament_files, extension  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 if not (shutil.which("gcc") or shutil.which("cc")):
     sys.exit("setup.py: error: no C compiler to build the ROS messages with: apt-get install gcc g++")
 if not (Path(sysconfig.get_path("include")) / "Python.h").exists():
     sys.exit("setup.py: error: no Python headers to build the ROS messages with: apt-get install python3-dev")
 
+MESSAGES, GENERATED = HERE / "mujoban_msgs_py", HERE / "build" / "rosidl"
+messages = extension(MESSAGES, GENERATED, HERE)
+
 setup(
     # A root of "." makes an editable install one path entry, so that it finds packages added later as well.
     package_dir={"": "."},
     packages=sorted({*find_packages(include=PACKAGES), PACKAGE, f"{PACKAGE}.msg"}),
-    ext_modules=[extension(HERE / "mujoban_msgs_py", HERE / "build" / "rosidl", HERE)],
+    ext_modules=[messages],
+    data_files=ament_files(MESSAGES, GENERATED),
 )

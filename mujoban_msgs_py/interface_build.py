@@ -126,6 +126,38 @@ def generate(source: Path, output: Path, python: Path) -> list[Path]:
     return sorted(path for path in generated if path.suffix in {".c", ".cpp"})
 
 
+def ament_files(source: Path, output: Path) -> list[tuple[str, list[str]]]:
+    """Return what makes a prefix know the package: entries of the ament index, and the interfaces' definitions.
+
+    They go below `share/` of the environment, where `ros2 interface show` and other tools look for them, also those of
+    a genuine ROS 2 that has the environment on its AMENT_PREFIX_PATH.
+
+    Args:
+        source: Folder with package.xml and msg/.
+        output: What `generate` has written to; the entries are added there.
+
+    Returns:
+        (folder, files) as setuptools takes data files, the files relative to the working directory.
+    """
+    messages = sorted(path.stem for path in (source / "msg").glob("*.msg"))
+    interfaces = [f"msg/{name}.{kind}" for name in messages for kind in ("idl", "msg")]
+    index = {
+        "packages": "",
+        "rosidl_interfaces": "\n".join(interfaces),
+        "package_run_dependencies": ";".join((*DEPENDENCIES, "rosidl_default_runtime")),
+    }
+    files = []
+    for kind, text in index.items():
+        marker = output / "ament_index" / kind / PACKAGE
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.write_text(text)
+        files.append((f"share/ament_index/resource_index/{kind}", [os.path.relpath(marker)]))
+    definitions = (*(source / "msg").glob("*.msg"), *(output / "idl" / PACKAGE / "msg").glob("*.idl"))
+    files.append((f"share/{PACKAGE}", [os.path.relpath(source / "package.xml")]))
+    files.append((f"share/{PACKAGE}/msg", sorted(os.path.relpath(path) for path in definitions)))
+    return files
+
+
 def extension(source: Path, output: Path, python: Path) -> Extension:
     """Generate the sources and return the extension module that holds the type support of all messages."""
     sources = generate(source, output, python)

@@ -24,7 +24,8 @@ def add_verbs(commands: Any) -> None:
     verbs = family.add_subparsers(title="Commands", metavar="verb", required=True)
     parser = verbs.add_parser("list", help="List all interface types available")
     for kind, title in KINDS.items():
-        parser.add_argument(f"-{kind[0]}", f"--only-{kind}s", action="store_true", help=f"Print out only {title.lower()}")
+        text = f"Print out only {title.lower()}"
+        parser.add_argument(f"-{kind[0]}", f"--only-{kind}s", action="store_true", help=text)
     parser.set_defaults(run=list_interfaces)
     parser = verbs.add_parser("package", help="Output a list of available interface types within one package")
     parser.add_argument("package_name", help="Name of the ROS package (e.g. 'example_interfaces')")
@@ -33,7 +34,7 @@ def add_verbs(commands: Any) -> None:
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--all-comments", action="store_true", help="Show all comments, also of nested interfaces")
     group.add_argument("--no-comments", action="store_true", help="Show no comments or whitespace")
-    parser.add_argument("type", help="Interface to show (e.g. 'example_interfaces/msg/String'); '-' reads it from stdin")
+    parser.add_argument("type", help="Interface to show (e.g. 'std_msgs/msg/String'); '-' reads it from stdin")
     parser.set_defaults(run=show)
 
 

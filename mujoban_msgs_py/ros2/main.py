@@ -12,7 +12,8 @@ from pathlib import Path
 
 from mujoban_core.signals import interrupt_status, interruptible
 
-USAGE_ERROR = 2
+FAILURE = 1
+"""Exit status of a verb that could not do what it was asked for; the arguments' own errors have 2."""
 FAMILIES = ("bag", "interface", "node", "param", "service", "topic")
 PACKAGE = "mujoban_msgs"
 
@@ -21,15 +22,18 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command.
 
     Returns:
-        Exit status: 0, 2 after one line on stderr about bad input, 130 or 143 after an interruption.
+        Exit status: 0, 1 after one line on stderr about bad input, 2 after one about the arguments, 130 or 143 after
+        an interruption.
     """
     arguments = list(sys.argv[1:] if args is None else args)
-    if importlib.util.find_spec("ros2cli") is not None:
+    # Where rosbag2 is missing, bags are read and written here.
+    has_verbs = not arguments or arguments[0] != "bag" or importlib.util.find_spec("ros2bag") is not None
+    if importlib.util.find_spec("ros2cli") is not None and has_verbs:
         from ros2cli.cli import main as genuine  # pyright: ignore[reportMissingImports]
 
         return genuine(argv=arguments)
     other = other_command(os.environ.get("PATH", ""), Path(sys.argv[0]))
-    if other is not None:
+    if other is not None and is_prepared(os.environ.get("AMENT_PREFIX_PATH", ""), arguments):
         os.execve(other, [str(other), *arguments], environment_outside(dict(os.environ), Path(sys.prefix)))
     with interruptible():
         return run(arguments)
@@ -45,6 +49,13 @@ def other_command(path: str, own: Path) -> Path | None:
         if not is_own and b"mujoban_msgs_py.ros2" not in candidate.read_bytes():
             return candidate
     return None
+
+
+def is_prepared(prefixes: str, arguments: Sequence[str]) -> bool:
+    """Return whether the ROS 2 of AMENT_PREFIX_PATH knows our messages, and bags if these are asked for."""
+    needed = {PACKAGE} | ({"ros2bag"} if arguments and arguments[0] == "bag" else set())
+    folders = [Path(p, "share/ament_index/resource_index/packages") for p in prefixes.split(os.pathsep) if p]
+    return all(any((folder / package).exists() for folder in folders) for package in needed)
 
 
 def environment_outside(environment: dict[str, str], prefix: Path) -> dict[str, str]:
@@ -75,7 +86,7 @@ def run(arguments: Sequence[str]) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         print(f"ros2: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return USAGE_ERROR
+        return FAILURE
     except KeyboardInterrupt as error:
         return interrupt_status(error)
 
