@@ -114,7 +114,11 @@ def _watch(
         if stamped and not hasattr(kind, "header"):
             raise CommandError("msg does not have header")
         receive = make_qos(10, reliable=False)
-        session.node.create_subscription(kind, topic, lambda data: note(session, data), receive, raw=True)
+
+        def hear(data: Any) -> None:
+            note(session, data)
+
+        session.node.create_subscription(kind, topic, hear, receive, raw=True)
         while True:
             session.spin_for(1.0)
             tell()
