@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -31,10 +32,12 @@ from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
 from mujoban_rl.losses.returns import windowed_returns
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
-from mujoban_rl.replay import TimeMajorReplay
+from mujoban_rl.replay import SequenceBuilder, SequenceReplay
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
 
+_KEPT: Final = (*BOARDS, "push", "reward", "over")
+"""What is kept of a step."""
 Window = dict[str, Tensor]
 """Successive steps from the replay, [B, n + 1] each."""
 
@@ -153,40 +156,52 @@ class PushReplay:
     def __init__(self, config: PushMPOConfig, actors: int) -> None:
         """Make room for the levels of so many actors."""
         self.config = config
-        boards = dict.fromkeys(BOARDS, ((), torch.int64)) | {"agent": ((), torch.uint8)}
-        others = {"push": ((), torch.int64), "reward": ((), torch.float32), "over": ((), torch.bool)}
-        self._rings = [
-            TimeMajorReplay(config.replay_steps, config.play.environments, boards | others) for _ in range(actors)
-        ]
+        play, self._length = config.play, config.play.steps + config.n_step
+        self._replay = SequenceReplay(
+            max(1, actors * config.replay_steps * play.environments // play.steps), self._length
+        )
+        self._builders = [self._builder() for _ in range(actors)]
+        self._after: list[dict[str, NDArray[Any]]] = [{} for _ in range(actors)]
+        """States after the last push of each actor."""
         self._generator = torch.Generator().manual_seed(config.seed)
+
+    def _builder(self) -> SequenceBuilder:
+        return SequenceBuilder(self._length, self.config.n_step)
 
     def add(self, experience: Experience) -> None:
         """Keep what an actor delivered."""
-        ring = self._rings[experience.actor]
-        columns = {name: torch.from_numpy(signed(experience.arrays[name]).copy()) for name in ring.storage}
+        actor, arrays = experience.actor, {name: signed(values) for name, values in experience.arrays.items()}
+        after = self._after[actor]
+        if any(not np.array_equal(after[name], arrays[name][0]) for name in after):
+            # An actor in other levels has taken the place of one that died.
+            self._builders[actor] = self._builder()
         for step in range(self.config.play.steps):
-            ring.add({name: column[step] for name, column in columns.items()})
+            sequence = self._builders[actor].add({name: arrays[name][step] for name in _KEPT})
+            if sequence is not None:
+                self._replay.add(sequence)
+        self._after[actor] = {name: arrays[f"last_{name}"].copy() for name in BOARDS}
 
     def sample(self) -> Window:
         """Return windows of n + 1 successive steps."""
-        filled = [ring for ring in self._rings if len(ring) > self.config.n_step]
-        each = [len(part) for part in np.array_split(np.arange(self.config.batch_size), len(filled))]
-        parts = [r.sample(n, self.config.n_step, self._generator) for r, n in zip(filled, each, strict=True)]
-        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        return self._replay.sample(self.config.batch_size, self._generator, self.config.n_step + 1)
 
     def state(self) -> State:
         """Return all pushes and the random state."""
-        tensors = {f"{i}.{k}": v[: len(ring)] for i, ring in enumerate(self._rings) for k, v in ring.storage.items()}
-        added = [ring.added for ring in self._rings]
-        return State({"added": added}, tensors | {"generator": self._generator.get_state()})
+        parts = {"replay": self._replay.state(), "own": State(tensors={"generator": self._generator.get_state()})}
+        for i, (builder, after) in enumerate(zip(self._builders, self._after, strict=True)):
+            states = State(tensors={name: torch.from_numpy(values) for name, values in after.items()})
+            parts[f"actor{i}"] = State.of({"builder": builder.state(), "after": states})
+        return State.of(parts)
 
     def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
-        self._generator.set_state(state.tensors["generator"])
-        for i, (ring, added) in enumerate(zip(self._rings, state.values["added"], strict=True)):
-            ring.added = added
-            for name, column in ring.storage.items():
-                column[: len(ring)] = state.tensors[f"{i}.{name}"]
+        """Take over what `state` returned, of as many actors or not."""
+        self._generator.set_state(state.part("own").tensors["generator"])
+        self._replay.restore(state.part("replay"))
+        for i, builder in enumerate(self._builders):
+            if f"actor{i}" in state.values:
+                part = state.part(f"actor{i}")
+                builder.restore(part.part("builder"))
+                self._after[i] = {name: values.numpy() for name, values in part.part("after").tensors.items()}
 
 
 def push_mpo(

@@ -21,37 +21,55 @@ from mujoban_rl.engine import Cadence
 
 
 @dataclass(frozen=True)
-class Imitation:
-    """Imitate the solver."""
+class _Command:
+    """What all trainings have in common."""
 
-    run: Path = Path("runs/planner")
-    """Run directory; an existing one is resumed."""
-    device: str = "cpu"
-    """Device of the network."""
     seconds: float | None = None
     """Stop after so many seconds; a later call resumes."""
-    samples: float = 1e12
-    """Stop at so many samples; a later call resumes."""
     evaluate_every: float = 300.0
     """Seconds between evaluations on held-out levels."""
     save_every: float = 120.0
     """Seconds between checkpoints."""
     threads: int = 1
     """Threads of the network on a CPU."""
+
+    def cadence(self, *, log_updates: int = 100, publish_updates: int = 10) -> Cadence:
+        """Return how often the run logs, publishes, evaluates and saves."""
+        return Cadence(
+            log_updates, publish_updates, evaluate_seconds=self.evaluate_every, save_seconds=self.save_every
+        )
+
+
+@dataclass(frozen=True)
+class Imitation(_Command):
+    """Imitate the solver."""
+
+    run: Path = Path("runs/planner")
+    """Run directory; an existing one is resumed."""
+    device: str = "cpu"
+    """Device of the network."""
+    samples: float = 1e12
+    """Stop at so many samples; a later call resumes."""
     processes: int = 1
     """Processes that make lessons: 1, or 0 for a deterministic run."""
     config: tyro.conf.OmitArgPrefixes[ImitationConfig] = field(default_factory=ImitationConfig)
 
     def main(self) -> None:
         """Train."""
-        torch.set_num_threads(self.threads)
-        cadence = Cadence(evaluate_seconds=self.evaluate_every, save_seconds=self.save_every)
-        trainer = imitation(self.config, self.run, cadence, device=self.device, processes=self.processes)
+        trainer = imitation(self.config, self.run, self.cadence(), device=self.device, processes=self.processes)
         trainer.run(limit_seconds=self.seconds, limit_samples=self.samples)
 
 
 @dataclass(frozen=True)
-class MPO:
+class _ActorCommand(_Command):
+    """What trainings with actors have in common."""
+
+    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
+    """Where levels are played or searched."""
+
+
+@dataclass(frozen=True)
+class MPO(_ActorCommand):
     """Maximum a posteriori policy optimisation in the abstract environment (paper C.2)."""
 
     run: Path = Path("runs/planner_mpo")
@@ -62,106 +80,57 @@ class MPO:
     """Recorded bags whose transitions join the replay."""
     device: str = "cpu"
     """Device of the network, and of actors in the same process."""
-    seconds: float | None = None
-    """Stop after so many seconds; a later call resumes."""
     updates: float = float("inf")
     """Stop at so many updates; a later call resumes."""
-    evaluate_every: float = 300.0
-    """Seconds between evaluations on held-out levels."""
-    save_every: float = 120.0
-    """Seconds between checkpoints."""
-    threads: int = 1
-    """Threads of the network on a CPU."""
-    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
     config: tyro.conf.OmitArgPrefixes[MPOConfig] = field(default_factory=MPOConfig)
 
     def main(self) -> None:
         """Train."""
-        torch.set_num_threads(self.threads)
         init = load(self.init, self.device, compiled=False) if self.init is not None else None
-        cadence = Cadence(
-            log_updates=50, publish_updates=5, evaluate_seconds=self.evaluate_every, save_seconds=self.save_every
-        )
         trainer = reinforcement(
-            self.config, self.run, cadence, device=self.device, actors=self.actors, init=init, init_path=self.init,
-            bags=self.bags,
+            self.config, self.run, self.cadence(log_updates=50, publish_updates=5), device=self.device,
+            actors=self.actors, init=init, init_path=self.init, bags=self.bags,
         )  # fmt: skip
         trainer.run(limit_seconds=self.seconds, limit_updates=self.updates)
 
 
 @dataclass(frozen=True)
-class ExpertIteration:
+class ExpertIteration(_ActorCommand):
     """Learn from what the planner's own search finds, without a solver."""
 
     run: Path = Path("runs/planner_search")
     """Run directory; an existing one is resumed."""
-    seconds: float | None = None
-    """Stop after so many seconds; a later call resumes."""
-    evaluate_every: float = 300.0
-    """Seconds between evaluations on held-out levels."""
-    save_every: float = 300.0
-    """Seconds between checkpoints."""
-    threads: int = 1
-    """Threads of the network."""
-    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
-    """Where searches run."""
     config: tyro.conf.OmitArgPrefixes[ExpertIterationConfig] = field(default_factory=ExpertIterationConfig)
 
     def main(self) -> None:
         """Train."""
-        torch.set_num_threads(self.threads)
-        cadence = Cadence(evaluate_seconds=self.evaluate_every, save_seconds=self.save_every)
-        expert_iteration(self.config, self.run, cadence, self.actors).run(limit_seconds=self.seconds)
+        expert_iteration(self.config, self.run, self.cadence(), self.actors).run(limit_seconds=self.seconds)
 
 
 @dataclass(frozen=True)
-class PPO:
+class PPO(_ActorCommand):
     """Proximal policy optimisation over pushes."""
 
     run: Path = Path("runs/planner_ppo")
     """Run directory; an existing one is resumed."""
-    seconds: float | None = None
-    """Stop after so many seconds; a later call resumes."""
-    evaluate_every: float = 300.0
-    """Seconds between evaluations on held-out levels."""
-    save_every: float = 120.0
-    """Seconds between checkpoints."""
-    threads: int = 1
-    """Threads of the network."""
-    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
-    """Where levels are played."""
     config: tyro.conf.OmitArgPrefixes[PushPPOConfig] = field(default_factory=PushPPOConfig)
 
     def main(self) -> None:
         """Train."""
-        torch.set_num_threads(self.threads)
-        cadence = Cadence(evaluate_seconds=self.evaluate_every, save_seconds=self.save_every, publish_updates=1)
-        push_ppo(self.config, self.run, cadence, self.actors).run(limit_seconds=self.seconds)
+        push_ppo(self.config, self.run, self.cadence(publish_updates=1), self.actors).run(limit_seconds=self.seconds)
 
 
 @dataclass(frozen=True)
-class MPOPushes:
+class MPOPushes(_ActorCommand):
     """Maximum a posteriori policy optimisation over pushes."""
 
     run: Path = Path("runs/planner_mpo_pushes")
     """Run directory; an existing one is resumed."""
-    seconds: float | None = None
-    """Stop after so many seconds; a later call resumes."""
-    evaluate_every: float = 300.0
-    """Seconds between evaluations on held-out levels."""
-    save_every: float = 120.0
-    """Seconds between checkpoints."""
-    threads: int = 1
-    """Threads of the network."""
-    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
-    """Where levels are played."""
     config: tyro.conf.OmitArgPrefixes[PushMPOConfig] = field(default_factory=PushMPOConfig)
 
     def main(self) -> None:
         """Train."""
-        torch.set_num_threads(self.threads)
-        cadence = Cadence(evaluate_seconds=self.evaluate_every, save_seconds=self.save_every)
-        push_mpo(self.config, self.run, cadence, self.actors).run(limit_seconds=self.seconds)
+        push_mpo(self.config, self.run, self.cadence(), self.actors).run(limit_seconds=self.seconds)
 
 
 def main() -> None:
@@ -174,6 +143,7 @@ def main() -> None:
         "mpo-pushes": MPOPushes,
     }
     command = tyro.extras.subcommand_cli_from_dict(commands)
+    torch.set_num_threads(command.threads)
     try:
         command.main()
     except (ValueError, OSError) as error:

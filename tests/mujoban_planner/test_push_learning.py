@@ -8,9 +8,10 @@ from mujoban_planner.boards import abstract_states, bit_boards
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.push_actor import PlayConfig
 from mujoban_planner.push_env import PUSHES
-from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
+from mujoban_planner.push_mpo import PushMPOConfig, PushReplay, push_mpo
 from mujoban_planner.push_policy import PushPolicy, images
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
+from mujoban_rl.actors import Experience
 from mujoban_rl.engine import Cadence
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_sokoban.generator import generate_batch
@@ -61,6 +62,30 @@ def test_the_loss_teaches_the_push_head_and_the_trunk_but_no_other_head(make, tm
     changed = {".".join(name.split(".")[:2]) for name in names}
     assert {"readout.push", "encoder.weight"} <= changed
     assert not {"readout.policy", "readout.dead", "readout.push_dead", "readout.walk", "readout.plan"} & changed
+
+
+def test_no_return_runs_from_the_levels_of_an_actor_that_died_into_those_of_its_successor():
+    config = PushMPOConfig(play=PLAY, batch_size=400, n_step=3, **SIZE)
+    replay = PushReplay(config, 1)
+
+    def deliver(actor, number):
+        # The target tells which actor it is, the wall which of its pushes.
+        mark = np.arange(4 * number, 4 * number + 5, dtype=np.uint64)[:, None].repeat(16, 1)
+        boards = {"wall": mark, "target": np.full_like(mark, actor), "box": mark, "agent": mark.astype(np.uint8)}
+        arrays = {name: values[:4] for name, values in boards.items()}
+        arrays |= {f"last_{name}": values[4] for name, values in boards.items()}
+        arrays |= {"push": np.zeros((4, 16), np.int64), "reward": np.zeros((4, 16), np.float32)}
+        replay.add(Experience(arrays | {"over": np.zeros((4, 16), bool)}, 64))
+
+    for actor in range(2):
+        for number in range(3):
+            deliver(actor, number)
+    window = replay.sample()
+    assert set(window["target"].flatten().tolist()) == {0, 1}
+    assert torch.equal(window["target"][:, 1:], window["target"][:, :-1])
+    assert torch.equal(window["wall"][:, 1:], window["wall"][:, :-1] + 1)
+    # 12 pushes of each actor hold a sequence of 7, and one of 4 that follow it.
+    assert set(window["wall"][:, 0].tolist()) == set(range(8))
 
 
 def test_a_policy_over_pushes_is_that_of_the_planner_that_ships_under_every_symmetry():
