@@ -13,6 +13,9 @@ import json
 import time
 from copy import deepcopy
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -23,12 +26,14 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from benchmarks.timing import milliseconds
+from mujoban_controller import train
 from mujoban_controller.controller import Gaussian, VisuomotorController, gaussian, gaussian_layers
-from mujoban_controller.goal_task import GoalTaskConfig
-from mujoban_controller.train import TrainConfig, make_learner
+from mujoban_controller.train import TrainConfig, make_trainer
 from mujoban_core.grid import GRID_SIZE, xy_to_cell
 from mujoban_core.interfaces import ControllerInput
 from mujoban_core.signals import StopSignal
+from mujoban_rl.engine import Learner, Source
+from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
 from mujoban_rl.losses.returns import td_target
 from mujoban_sim.world import World
@@ -41,8 +46,8 @@ class Options:
     """What to measure."""
 
     repeats: int = 200
-    rounds: int = 4
-    """Rounds of collecting and learning to time."""
+    rounds: int = 8
+    """Updates to time."""
     pendulum_steps: int = 0
     """Environment steps of MPO on Pendulum-v1."""
     random_steps: int = 0
@@ -62,21 +67,39 @@ def step_time(repeats: int) -> float:
 
 
 def training_rates(rounds: int) -> dict[str, float]:
-    """Return frames per second of processor time of collection with camera, and of learning from them."""
-    learner = make_learner(TrainConfig(task=GoalTaskConfig()))
-    learner.collect()
-    learner.learn()
-    frames, start = learner.frames, time.process_time()
-    for _ in range(rounds):
-        learner.collect()
-    collected = time.process_time()
-    learner.learn()
-    learned = time.process_time()
-    played = learner.frames - frames
-    return {
-        "collected_frames_per_second": played / (collected - start),
-        "learned_frames_per_second": played * learner.config.reuse / (learned - collected),
+    """Return environment steps per CPU second of training, and the share of learning in them.
+
+    Of the teacher by PPO and by MPO, and of MPO of the camera policy.
+    """
+    stages = {
+        "ppo": TrainConfig(algorithm="ppo"),
+        "mpo": TrainConfig(algorithm="mpo"),
+        "camera_mpo": TrainConfig(stage="mpo"),
     }
+    rates = {}
+    with TemporaryDirectory() as folder:
+        for name, config in stages.items():
+            trainer = make_trainer(train.Options(Path(folder) / name, config, evaluation_episodes=0))
+            steps, playing, learning = _time(trainer.learner, trainer.source, rounds)
+            rates[f"{name}_steps_per_second"] = steps / (playing + learning)
+            rates[f"{name}_share_of_learning"] = learning / (playing + learning)
+    return rates
+
+
+def _time(learner: Learner[Any], source: Source[Any], rounds: int) -> tuple[int, float, float]:
+    """Return the environment steps of some updates, and the CPU seconds of playing and of learning."""
+    guard, playing, learning = NaNGuard(), 0.0, 0.0
+    source.publish(learner.weights(), 0)
+    learner.update(source.next_batch(), 0.0, guard)
+    before = source.samples
+    for _ in range(rounds):
+        start = time.process_time()
+        batch = source.next_batch()
+        middle = time.process_time()
+        learner.update(batch, 0.0, guard)
+        playing, learning = playing + middle - start, learning + time.process_time() - middle
+    source.close()
+    return source.samples - before, playing, learning
 
 
 class _Policy(nn.Module):
@@ -228,7 +251,7 @@ class RandomDrive:
 def run() -> dict[str, object]:
     """Return the quick measurements: the time of a step, and the speed of training."""
     torch.set_num_threads(1)
-    return {"controller_step_ms": step_time(200), **training_rates(2)}
+    return {"controller_step_ms": step_time(200), **training_rates(4)}
 
 
 def main() -> None:

@@ -209,6 +209,11 @@ class VisuomotorController(nn.Module, Controller):
         self.register_buffer("axes", torch.tensor(INSTRUCTION_AXES, dtype=torch.float32), persistent=False)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
+    @property
+    def fitted(self) -> bool:
+        """Whether inputs are normalised by data, which fresh weights have not seen."""
+        return not bool((self.proprio_scale == 1.0).all())
+
     def fit_normalisation(self, proprio: Tensor) -> None:
         """Take mean and deviation of proprioceptive samples, [M, P], for the normalisation of inputs."""
         self.proprio_mean.copy_(proprio.mean(0))

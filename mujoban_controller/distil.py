@@ -4,13 +4,13 @@ DAgger (Ross et al. 2011): the student acts, the teacher says what it would have
 the same from what it can see. Auxiliary heads, which do not ship, make its memory tell the goal's kind and how
 far robot and box are from their targets; that is the part of the teacher's view that the student has to infer.
 
-Shapes: B robots, T ticks, M sequences in a batch, U actuators, F features.
+Shapes: B robots, W ticks of a window, M windows of a batch, U actuators, F features.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,42 +18,52 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.controller import ControllerOutput, Recurrent, VisuomotorController
-from mujoban_controller.drivers import Driver, WanderingDriver
+from mujoban_controller.controller import ControllerOutput, VisuomotorController
+from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
-from mujoban_controller.goal_task import GoalTask, TaskStep
-from mujoban_controller.replay import SequenceReplay, memory_fields
+from mujoban_controller.goal_task import GoalTask
+from mujoban_controller.play import INPUT_FIELDS, Batch, CameraPlayer, Fields, memory_of
+from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.grid import Instruction
-from mujoban_core.interfaces import Memory, renew_rows
+from mujoban_core.interfaces import ControllerInput
+from mujoban_rl.engine import Scalars, State
+from mujoban_rl.limits import NaNGuard
+from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_sim.goals import GoalKind
 
 _KINDS = len(GoalKind) - 1
+_KEPT = 0.9
+"""Share of the wandering torques that stays from tick to tick."""
 
 
 @dataclass(frozen=True)
 class DistilConfig:
     """Settings of distillation."""
 
-    length: int = 8
-    """T, ticks of a sequence."""
-    sequences: int = 16
-    """M, sequences of a batch."""
-    replay: int = 20_000
-    """Sequences in the replay."""
+    window: int = 8
+    """W."""
+    windows: int = 16
+    """M."""
+    sequence: int = 8
+    """Ticks of a sequence in the replay, at least W."""
+    replay: int = 100_000
+    """Frames in the replay."""
+    first: int = 2_000
+    """Frames before the first update."""
     reuse: float = 3.0
-    """Times that each frame is trained on, on average."""
-    warm_up: int = 100_000
-    """Frames over which the share of rows that the student does not drive falls from one to `guided`."""
-    guided: float = 0.3
-    """Share of rows that the scripted driver drives, with targets that wander: positions that a student needs to tell
+    """Times that each frame is learned from, on average."""
+    warm_up: int = 60_000
+    """Frames over which the share of rows that the teacher drives falls from one to `guided`."""
+    guided: float = 0.2
+    """Share of rows that the teacher drives, with torques that wander: places that a student needs to tell
     apart before it is good, and has left behind once it is."""
-    wander: float = 0.12
-    """Standard deviation of these targets in cells."""
+    wander: float = 0.3
+    """Standard deviation of the wandering part of these torques."""
     noise: float = 0.1
-    """Deviation of the noise on the torques of a third of the rows, which shows the student more states."""
+    """Deviation of the noise on the torques of a third of the other rows, which shows the student more states."""
     learning_rate: float = 1e-3
-    final_rate: float = 0.02
-    """Share of the learning rate that is left at the end of the cosine schedule."""
+    warm_up_share: float = 0.01
+    """Share of the budget over which the learning rate rises; it falls by a cosine after that."""
     clip: float = 5.0
     goal_weight: float = 0.5
     kind_weight: float = 0.05
@@ -64,6 +74,9 @@ class DistilConfig:
     """Largest relative change of each colour's brightness, drawn anew for each sequence."""
     average: float = 0.998
     """Decay of the weights' moving average, which is what ships."""
+
+    skipped = 0
+    """Ticks of a window in which nothing is learned."""
 
 
 class GoalHead(nn.Module):
@@ -79,16 +92,17 @@ class GoalHead(nn.Module):
 
 
 def imitation_loss(
-    output: ControllerOutput, head: GoalHead, batch: dict[str, Tensor], config: DistilConfig
+    output: ControllerOutput, head: GoalHead, batch: Mapping[str, Tensor], config: DistilConfig
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return loss and statistics of a batch of sequences [M, T]."""
+    """Return loss and statistics of a batch of windows [M, W]."""
     mean, scale = output.action
     label = batch["label"]
     blocked = (batch["kind"] == GoalKind.HOLD) & (batch["instruction"] != Instruction.STAY)
     weight = torch.where(blocked, config.infeasible_weight, 1.0)[..., None]
     action = (weight * functional.smooth_l1_loss(mean, label, beta=0.1, reduction="none")).mean()
     # The scale learns how far the teacher's torques stray from the mean, and does not move the mean.
-    spread = -torch.distributions.Normal(mean.detach(), scale).log_prob(label).clamp(-10.0, 3.0).mean()
+    teachers = torch.distributions.Normal(mean.detach(), scale, validate_args=False)
+    spread = -teachers.log_prob(label).clamp(-10.0, 3.0).mean()
     offsets, logits = head(output.features)
     goal = functional.smooth_l1_loss(offsets, batch["goal"], beta=0.1)
     kind = functional.cross_entropy(logits.flatten(0, 1), batch["kind"].flatten())
@@ -104,112 +118,117 @@ def imitation_loss(
     return loss, {k: v.detach() for k, v in stats.items()}
 
 
-def jitter_colours(frame: Tensor, amount: float) -> Tensor:
-    """Return frames [M, T, H, W, 3] with each colour of each sequence brighter or darker, as floats up to 255."""
-    gain = 1.0 + amount * (2.0 * torch.rand(len(frame), 1, 1, 1, 3, device=frame.device) - 1.0)
+def jitter_colours(frame: Tensor, amount: float, generator: torch.Generator) -> Tensor:
+    """Return frames [M, W, H, W, 3] with each colour of each window brighter or darker, as floats up to 255."""
+    gain = 1.0 + amount * (2.0 * torch.rand(len(frame), 1, 1, 1, 3, generator=generator) - 1.0)
     return (frame * gain).clamp_(max=255.0)
 
 
-class Collector:
-    """Lets the student act in the goal task and asks the teacher for labels."""
+class DistilPlayer(CameraPlayer):
+    """Lets the student act, or the teacher with torques that wander, and asks the teacher for labels."""
 
     def __init__(
         self, task: GoalTask, student: VisuomotorController, teacher: Driver, config: DistilConfig,
-        rng: np.random.Generator,
+        generator: torch.Generator,
     ) -> None:  # fmt: skip
-        """Collect from `task` with randomness from `rng`."""
-        self.task, self.student, self.teacher, self.config, self._rng = task, student, teacher, config, rng
-        self._guide = WanderingDriver(rng, config.wander)
-        b = task.world.batch
-        self._memory: Memory = student.initial_memory(b)
-        self.frames = 0
-        """Frames collected so far."""
+        """Play `task` with randomness from `generator`."""
+        super().__init__(task, student, generator)
+        self._teacher, self._config = teacher, config
+        self._wandering = torch.zeros(task.torque.shape)
+        self._driven = torch.ones(len(task.torque), dtype=torch.bool)
+        self._frames = 0
 
-    def collect(self) -> tuple[dict[str, NDArray], dict[str, NDArray], list[TaskStep]]:
-        """Play T ticks; return per-tick fields [T, B, ...], the memory at the start, and what happened."""
-        b = self.task.world.batch
-        share = 1.0 - self.frames / max(self.config.warm_up, 1)
-        driven = self._rng.random(b) < max(share, self.config.guided)
-        noisy = self._rng.random(b) < 1 / 3
-        starts = memory_fields(self._memory)
-        rows, steps = [], []
-        for _ in range(self.config.length):
-            tick, outcome = self._tick(driven, noisy)
-            rows.append(tick)
-            steps.append(outcome)
-        self.frames += self.config.length * b
-        return {k: np.stack([r[k] for r in rows]) for k in rows[0]}, starts, steps
-
-    @torch.inference_mode()
-    def _tick(self, driven: NDArray[np.bool_], noisy: NDArray[np.bool_]) -> tuple[dict[str, Any], TaskStep]:
-        task, first = self.task, self.task.first.copy()
-        self._memory = renew_rows(self._memory, self.student.initial_memory(len(first)), first)
-        inputs = task.observe()
-        label = self.teacher(task)
-        output = self.student(*self.student.to_tensors(inputs), memory=Recurrent(*self._memory))
-        self._memory = output.memory
-        torque = output.action.mean[:, 0].numpy()
-        torque = np.where(driven[:, None], self._guide(task), torque)
-        torque = torque + noisy[:, None] * self._rng.normal(0.0, self.config.noise, torque.shape)
+    def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
+        config, task, generator = self._config, self.task, self.generator
+        label = self._teacher(task)
+        if self._frames % (config.window * len(mean)) == 0:
+            share = max(1.0 - self._frames / max(config.warm_up, 1), config.guided)
+            self._driven = torch.rand(len(mean), generator=generator) < share
+        self._frames += len(mean)
+        noise = torch.randn(mean.shape, generator=generator)
+        self._wandering = _KEPT * self._wandering + (1.0 - _KEPT**2) ** 0.5 * config.wander * noise
+        # Every third row is disturbed.
+        disturbed = (torch.arange(len(mean)) % 3 == 0)[:, None]
+        own = mean + config.noise * disturbed * torch.randn(mean.shape, generator=generator)
+        torque = torch.where(self._driven[:, None], torch.from_numpy(label) + self._wandering, own)
         goals = task.world.goals
-        tick = {
-            "frame": inputs.frame,
-            "proprio": inputs.proprio,
-            "instruction": inputs.instruction,
-            "terminated": inputs.terminated,
-            "first": first,
-            "label": label.astype(np.float32),
-            "goal": goal_offsets(task.world),
-            "kind": goals.kind.copy(),
-        }
-        return tick, task.step(np.clip(torque, -1.0, 1.0).astype(np.float32))
+        extra = {"label": label, "goal": goal_offsets(task.world), "kind": goals.kind.copy()}
+        return torque.clamp(-1.0, 1.0).numpy(), extra
+
+    def state(self) -> State:
+        """Return all that changes but the weights."""
+        own = State({"frames": self._frames}, {"wandering": self._wandering, "driven": self._driven})
+        return State.of({"student": super().state(), "guide": own})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        super().restore(state.part("student"))
+        own = state.part("guide")
+        self._frames = own.values["frames"]
+        self._wandering, self._driven = own.tensors["wandering"], own.tensors["driven"]
 
 
-class Distiller:
-    """Student, auxiliary head, averaged weights and optimiser; one `update` per batch."""
+class DistilLearner(ProductLearner[Batch]):
+    """Student, auxiliary head and averaged weights."""
 
-    def __init__(self, student: VisuomotorController, config: DistilConfig, total: int) -> None:
-        """Train `student` in place with a cosine schedule over `total` updates."""
-        self.student, self.config, self.total = student, config, max(total, 1)
+    def __init__(
+        self,
+        student: VisuomotorController,
+        config: DistilConfig,
+        generator: torch.Generator,
+        validation: Validation | None = None,
+    ) -> None:
+        """Train `student` in place; `generator` draws the jitter of colours."""
+        super().__init__(validation or Validation())
+        self.student, self.config, self._generator = student, config, generator
         self.head = GoalHead(student.hidden + student.config["features"])  # pyright: ignore[reportArgumentType]
-        self.average = VisuomotorController(**student.config)  # pyright: ignore[reportArgumentType]
-        self.average.load_state_dict(student.state_dict())
-        self.average.requires_grad_(False)
+        self._average = moving_average(student, config.average, warm_up=True)
         parameters = [*student.parameters(), *self.head.parameters()]
-        self.optimiser = torch.optim.Adam(parameters, config.learning_rate, foreach=True)
-        self.updates = 0
+        self._adam = torch.optim.Adam(parameters, config.learning_rate, foreach=True)
+        self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up_share))
 
-    def update(self, replay: SequenceReplay, rng: np.random.Generator) -> dict[str, Tensor]:
-        """Take one gradient step; return statistics. Non-finite gradients raise at the caller's guard."""
-        config, student = self.config, self.student
-        device = student.mean.weight.device
-        batch = replay.sample(config.sequences, rng, device)
-        for group in self.optimiser.param_groups:
-            group["lr"] = config.learning_rate * self._schedule()
-        output = student(
-            jitter_colours(batch["frame"], config.jitter), batch["proprio"], batch["instruction"], batch["terminated"],
-            Recurrent(*(batch[f"memory{i}"] for i in range(3))), batch["first"],
-        )  # fmt: skip
+    @property
+    def product(self) -> VisuomotorController:
+        """The moving average of the student."""
+        module = self._average.module
+        assert isinstance(module, VisuomotorController)
+        return module
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """Student, its moving average, the auxiliary head."""
+        return {"student": self.student, "average": self._average, "head": self.head}
+
+    @property
+    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """One for all."""
+        return {"adam": self._adam}
+
+    def own_state(self) -> State:
+        """Return the random state."""
+        return State(tensors={"generator": self._generator.get_state()})
+
+    def restore_own(self, state: State) -> None:
+        """Take over what `own_state` returned."""
+        self._generator.set_state(state.tensors["generator"])
+
+    def weights(self) -> Mapping[str, Tensor]:
+        """Return the student's."""
+        return self.student.state_dict()
+
+    def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
+        """Take one gradient step."""
+        student, config = self.student, self.config
+        if not student.fitted and bool(torch.isfinite(batch["proprio"]).all()):
+            for policy in (student, self.product):
+                policy.fit_normalisation(batch["proprio"].flatten(0, 1))
+        frame = jitter_colours(batch["frame"], config.jitter, self._generator)
+        inputs = (batch[name] for name in INPUT_FIELDS if name != "frame")
+        output = student(frame, *inputs, memory_of(batch), batch["first"])
         loss, stats = imitation_loss(output, self.head, batch, config)
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_([*student.parameters(), *self.head.parameters()], config.clip)
-        if bool(torch.isfinite(norm)):
-            self.optimiser.step()
-            self._follow()
-        self.updates += 1
-        return {**stats, "gradient_norm": norm}
-
-    def _schedule(self) -> float:
-        progress = min(self.updates / self.total, 1.0)
-        warm = min(1.0, (self.updates + 1) / 200)
-        floor = self.config.final_rate
-        return warm * (floor + (1 - floor) * 0.5 * (1 + np.cos(np.pi * progress)))
-
-    @torch.no_grad()
-    def _follow(self) -> None:
-        decay = min(self.config.average, (1 + self.updates) / (10 + self.updates))
-        for ours, theirs in zip(self.average.parameters(), self.student.parameters(), strict=True):
-            ours.lerp_(theirs, 1.0 - decay)
-        self.average.proprio_mean.copy_(self.student.proprio_mean)
-        self.average.proprio_scale.copy_(self.student.proprio_scale)
+        norm = guarded_step(loss, [self._adam], guard, clip=config.clip)
+        if norm is not None:
+            self._average.update_parameters(student)
+            stats["gradient_norm"] = norm
+        self._schedule.follow(progress)
+        return {k: float(v) for k, v in stats.items()}

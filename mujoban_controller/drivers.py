@@ -8,32 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import privileged_features
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.privileged import PrivilegedPolicy
-from mujoban_controller.scripted import scripted_driver
 from mujoban_core.interfaces import Controller, Memory, renew_rows
 
 Driver = Callable[[GoalTask], NDArray[np.float32]]
 """Torques in [-1, 1] for the task's current tick, [B, U]."""
-
-
-class WanderingDriver:
-    """The scripted driver with targets that wander, which shows a student positions off lanes and centres."""
-
-    def __init__(self, rng: np.random.Generator, deviation: float = 0.12, memory: float = 0.97) -> None:
-        """Wander with a standard `deviation` in cells and a share of `memory` kept from tick to tick."""
-        self._rng, self._deviation, self._memory = rng, deviation, memory
-        self._offset: NDArray[np.float64] | None = None
-
-    def __call__(self, task: GoalTask) -> NDArray[np.float32]:
-        """Return torques, [B, 2]."""
-        size = task.world.body.cell_size
-        noise = self._rng.normal(0.0, self._deviation * size, (task.world.batch, 2))
-        if self._offset is None:
-            self._offset = noise
-        self._offset = self._memory * self._offset + (1.0 - self._memory**2) ** 0.5 * noise
-        return scripted_driver(task, self._offset)
 
 
 class ControllerDriver:
@@ -63,5 +43,5 @@ class PrivilegedDriver:
     @torch.inference_mode()
     def __call__(self, task: GoalTask) -> NDArray[np.float32]:
         """Return the policy's mean torques limited to [-1, 1], [B, U]."""
-        state = torch.from_numpy(privileged_features(task.world, task.elapsed))
-        return self._policy(state).mean.clamp(-1.0, 1.0).numpy()
+        action = self._policy(torch.from_numpy(task.features())).mean.clamp(-1.0, 1.0)
+        return task.torque_of(action.numpy())

@@ -18,9 +18,10 @@ import tyro
 
 from mujoban_controller import SHIPPED
 from mujoban_controller.controller import VisuomotorController
-from mujoban_controller.drivers import Driver, PrivilegedDriver, scripted_driver
+from mujoban_controller.drivers import Driver, PrivilegedDriver
 from mujoban_controller.judge import judge
 from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_controller.scripted import scripted_driver
 from mujoban_core.files import write_atomically
 from mujoban_core.interfaces import Controller
 from mujoban_rl.weights import digest, load_weights

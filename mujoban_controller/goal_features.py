@@ -1,49 +1,98 @@
-"""What the critic and a privileged teacher see: the goal, the boxes and the walls around (paper C.3).
+"""What the critic and a privileged teacher see: robot, goal, boxes and walls around (paper C.3).
 
-Everything is turned into the frame of the instruction, whose x-axis is the instructed direction and whose
-y-axis points to its left, and scaled by the cell, so that one policy serves all directions and bodies.
+Lengths are in cells, and everything is seen from two frames: the *instruction's*, whose x-axis is the instructed
+direction and whose y-axis points to its left, and the *robot's*, whose x-axis is the heading of the side that it puts
+ahead. So one policy serves all directions, and a body whose sides are alike (`Body.symmetry`) always sees a goal that
+lies ahead. Mirroring the features (`FeatureLayout.mirror`) gives what the mirrored robot sees.
 
-Shapes: B robots, K boxes, P proprioceptive values, D features.
+Shapes: B robots, K boxes, J joints, U actuators, P proprioceptive values, D features.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_controller.goal_view import GoalView
 from mujoban_core.bodies import Body
 from mujoban_core.grid import GRID_SIZE, INSTRUCTION_AXES, OFFSETS_XY, cell_to_xy, turn_to_instruction, xy_to_cell
-from mujoban_sim.goals import GoalKind, GoalTracker
+from mujoban_sim.goals import GoalKind
 
 _NEIGHBOURS = np.array([[x, y] for x in (-1, 0, 1, 2) for y in (-1, 0, 1) if (x, y) != (0, 0)], np.float64)
 """Cells around the origin cell whose contents matter, (along, left), [11, 2]."""
+_MIRRORED_NEIGHBOURS = [int((n * [1, -1] == _NEIGHBOURS).all(1).argmax()) for n in _NEIGHBOURS]
 GOAL_SIZE = 4
 """Values of `goal_offsets`."""
+_NEAR = 5.0
+"""Offsets are told a second time, that much larger and limited to [-1, 1]: what matters is the last tenth of a cell."""
+_GRAVITY = 9.81
+BOX_FRICTION = 0.5
+"""Sliding friction of a box on the floor, in every world; how far a box coasts follows from it."""
 
 
-class GoalView(Protocol):
-    """What the features are made of: a `World`, or ticks of a recording."""
+class Mirror(NamedTuple):
+    """Entry i of a mirrored vector is `sign[i]` times entry `source[i]`."""
 
-    batch: int
-    body: Body
-    goals: GoalTracker
-    wall: NDArray[np.bool_]
-    proprio: NDArray[np.float32]
-    pose: NDArray[np.float32]
-    velocity: NDArray[np.float32]
-    box_position: NDArray[np.float32]
-    box_speed: NDArray[np.float32]
-    box_cell: NDArray[np.int64]
+    source: NDArray[np.int64]
+    sign: NDArray[np.float32]
 
 
-def feature_size(proprio_size: int) -> int:
-    """Return D for a body with P proprioceptive values."""
-    return proprio_size + 2 + 3 + GOAL_SIZE + (len(GoalKind) - 1) + 3 + 2 + 2 * len(_NEIGHBOURS) + 1
+class FeatureLayout(NamedTuple):
+    """Sizes and symmetries of the privileged features and of actions as the side ahead sees them."""
+
+    size: int
+    """D."""
+    mirror: Mirror
+    """Of the features, [D]."""
+    mirror_action: Mirror
+    """Of the actions, [U]."""
+    joints: NDArray[np.int64]
+    """Order of joints as each side sees them, [S, J]."""
+    actuators: NDArray[np.int64]
+    """Order of actuators as each side sees them, [S, U]."""
+
+
+_FLIP_Y = (1.0, -1.0)
+# Reflections at the x-z plane turn an angular velocity's x and z, and a velocity's y.
+_VECTOR, _ROTATION = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
+
+
+@cache
+def feature_layout(body: Body) -> FeatureLayout:
+    """Return the layout for a body."""
+    source, sign = (np.array(v) for v in body.symmetry.mirror)
+    posture = np.flatnonzero([r is not None for r in body.joint_range])
+    sides = np.array(body.sides, np.int64)
+    actuators = np.array([body.of_actuators(order) for order in body.sides], np.int64)
+    acting = np.array(body.of_actuators(body.symmetry.mirror.source), np.int64)
+    acting_sign = sign[[body.joints.index(a.joint) for a in body.actuators]]
+    # The order of `privileged_features`: (source, sign) of each block.
+    blocks: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = [
+        (np.array([np.flatnonzero(posture == s)[0] for s in source[posture]], np.int64), sign[posture]),
+        (source, sign),
+        (acting, acting_sign),
+    ]
+    plain = [_VECTOR, _ROTATION, _VECTOR, *[_FLIP_Y] * 12, (1.0,), (1.0, 1.0, 1.0), (1.0,)]
+    blocks += [(np.arange(len(s)), np.array(s)) for s in plain]
+    blocks += [(np.array(_MIRRORED_NEIGHBOURS), np.ones(len(_NEIGHBOURS)))] * 2
+    start, sources = 0, []
+    for block, _ in blocks:
+        sources.append(start + block)
+        start += len(block)
+    mirror = Mirror(np.concatenate(sources), np.concatenate([s for _, s in blocks]).astype(np.float32))
+    return FeatureLayout(start, mirror, Mirror(acting, acting_sign.astype(np.float32)), sides, actuators)
+
+
+def wrap(angle: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return angles in [-pi, pi)."""
+    return (np.asarray(angle, np.float64) + np.pi) % (2 * np.pi) - np.pi
 
 
 def _turn(v: NDArray[np.floating], axis: NDArray[np.float64]) -> NDArray[np.floating]:
+    """Return vectors, [..., 2], in the frame whose x-axis is `axis`."""
     return np.stack(turn_to_instruction(v[..., 0], v[..., 1], axis[..., 0], axis[..., 1]), -1)
 
 
@@ -60,32 +109,101 @@ def goal_offsets(world: GoalView) -> NDArray[np.float32]:
     return (np.concatenate([robot, box], 1) / world.body.cell_size).astype(np.float32)
 
 
-def privileged_features(world: GoalView, elapsed: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the critic's view of the state, [B, D].
+def side_ahead(world: GoalView) -> NDArray[np.int64]:
+    """Return which side of each robot looks best at its goal, in quarter turns to the left, [B].
+
+    That is the instruction's direction for a push. Otherwise it is where the target lies, which may be behind after
+    an overshoot.
+    """
+    if world.body.symmetry.sides == 1:
+        return np.zeros(world.batch, np.int64)
+    goals = world.goals
+    offset = goals.robot_target - world.pose[:, :2]
+    course = np.where((goals.kind == GoalKind.PUSH)[:, None], OFFSETS_XY[goals.direction], offset)
+    there = (goals.kind != GoalKind.PUSH) & (np.hypot(*offset.T) < 0.05 * world.body.cell_size)
+    angle = np.where(there, world.pose[:, 2], np.arctan2(course[:, 1], course[:, 0]))
+    return np.rint(wrap(angle - world.pose[:, 2]) / (np.pi / 2)).astype(np.int64) % 4
+
+
+def rest_position(world: GoalView) -> NDArray[np.float64]:
+    """Return where the pushed boxes will come to rest if they coast along the instruction, in metres, [B, 2]."""
+    goals, rows = world.goals, np.arange(world.batch)
+    speed = world.box_speed[rows, goals.box_index].astype(np.float64)
+    coast = speed**2 / (2 * BOX_FRICTION * _GRAVITY)
+    return world.box_position[rows, goals.box_index].astype(np.float64) + coast[:, None] * OFFSETS_XY[goals.direction]
+
+
+def privileged_features(
+    world: GoalView, elapsed: NDArray[np.float64], torque: NDArray[np.float32], side: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Return the view of critic and teacher, [B, D].
 
     Args:
         world: Its `goals` are the instructions in force.
         elapsed: Share of the instruction's time limit that has passed, [B].
+        torque: Applied in the tick before, [B, U].
+        side: The side ahead, [B]; see `side_ahead`.
     """
-    goals, rows, size = world.goals, np.arange(world.batch), world.body.cell_size
-    axis = INSTRUCTION_AXES[goals.direction]
+    body, goals, rows, size = world.body, world.goals, np.arange(world.batch), world.body.cell_size
+    layout, at = feature_layout(body), body.proprio
+    quarter = side * (np.pi / 2)
+    heading = world.pose[:, 2] + quarter
+    ahead = np.stack([np.cos(heading), np.sin(heading)], 1)
+    lane = INSTRUCTION_AXES[goals.direction]
+    # Vectors of proprioception are in the frame of the robot's own front.
+    own = np.stack([np.cos(quarter), np.sin(quarter)], 1)
+
+    def felt(part: slice) -> NDArray[np.floating]:
+        v = world.proprio[:, part]
+        return np.concatenate([_turn(v[:, :2], own), v[:, 2:]], 1)
+
+    order = layout.joints[side]
     push = (goals.kind == GoalKind.PUSH)[:, None]
-    heading = np.stack([np.cos(world.pose[:, 2]), np.sin(world.pose[:, 2])], 1)
-    box = world.box_position[rows, goals.box_index]
+    box = world.box_position[rows, goals.box_index].astype(np.float64)
+    to_target = (goals.robot_target - world.pose[:, :2]) / size
+    to_box = np.where(push, (box - world.pose[:, :2]) / size, 0.0)
+    box_left = np.where(push, (goals.box_target - box) / size, 0.0)
+    rest_left = np.where(push, (goals.box_target - rest_position(world)) / size, 0.0)
+    vectors = [to_target, to_box, box_left, rest_left]
     parts = [
-        np.clip(world.proprio / 5.0, -3.0, 3.0),
-        _turn(heading, axis),
-        _turn(world.velocity[:, :2] / size, axis),
-        world.velocity[:, 2:] / 5.0,
-        2.0 * goal_offsets(world),
-        np.eye(len(GoalKind) - 1)[np.minimum(goals.kind, GoalKind.HOLD)],
-        np.where(push, _turn(box - world.pose[:, :2], axis) / size, 0.0),
+        _posture(world, order),
+        np.take_along_axis(world.proprio[:, at.joint_velocity], order, 1),
+        np.take_along_axis(torque, layout.actuators[side], 1),
+        felt(at.linear_velocity) / size,
+        felt(at.angular_velocity),
+        felt(at.up_axis),
+        _relative_heading(world, heading, lane),
+        *(_turn(v, ahead) for v in vectors),
+        *(_turn(v, lane) for v in vectors[:3]),
+        *(np.clip(_NEAR * _turn(v, lane), -1.0, 1.0) for v in (to_target, to_box, box_left, rest_left)),
         np.where(push, world.box_speed[rows, goals.box_index][:, None] / size, 0.0),
-        2.0 * _turn(world.pose[:, :2] - cell_to_xy(goals.origin_cell, size), axis) / size,
-        _surroundings(world, axis),
+        np.eye(len(GoalKind) - 1)[np.minimum(goals.kind, GoalKind.HOLD)],
         elapsed[:, None],
+        _surroundings(world, lane),
     ]
     return np.concatenate(parts, 1).astype(np.float32)
+
+
+def _posture(world: GoalView, order: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the positions of joints that have a range, from -1 to 1 within it."""
+    ranges = world.body.joint_range
+    kept = [j for j, limits in enumerate(ranges) if limits is not None]
+    low, high = np.array([limits or (-1.0, 1.0) for limits in ranges]).T
+    share = (2.0 * world.proprio[:, world.body.proprio.joint_position] - low - high) / (high - low)
+    return np.take_along_axis(share, order, 1)[:, kept]
+
+
+def _relative_heading(
+    world: GoalView, heading: NDArray[np.float64], along: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the direction of the instruction seen from the robot, (ahead, left), [B, 2].
+
+    A body with several fronts may stand along any axis of the grid unless it pushes.
+    """
+    error = wrap(np.arctan2(along[:, 1], along[:, 0]) - heading)
+    if world.body.symmetry.sides > 1:
+        error = np.where(world.goals.kind == GoalKind.PUSH, error, wrap(4 * error) / 4)
+    return np.stack([np.cos(error), np.sin(error)], 1)
 
 
 def _surroundings(world: GoalView, along: NDArray[np.float64]) -> NDArray[np.float64]:

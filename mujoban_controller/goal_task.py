@@ -1,9 +1,8 @@
 """The goal task in which the controller learns (paper C.3), over the vectorised world.
 
-The robot gets instructions, random or from a planner, and +4 for each that it completes, -5 for each that it
-does not complete within 120 steps, and a small penalty while it moves backwards. Boxes that leave the
-middle of their lanes cost something as well, since they jam at pegs later. An instruction that ends is followed
-by the next: the return bootstraps through it, except where one failed.
+The robot gets instructions, random or from a planner, and is rewarded for each that it completes and for coming
+nearer to it (`goal_rewards`). An instruction that ends is followed by the next: the return bootstraps through it,
+except where one failed.
 
 Shapes: B robots, M selected rows, P proprioceptive values, U actuators.
 """
@@ -14,110 +13,41 @@ import math
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import drift, goal_offsets
-from mujoban_controller.instructions import (
-    EXACT,
-    InstructionConfig,
-    TerminationConfig,
-    TerminationNoise,
-    feasible_kinds,
-    random_instruction,
-)
-from mujoban_core.grid import COMPLETION_TOLERANCE, DIFFICULTIES, INSTRUCTION_LIMIT, Instruction
+from mujoban_controller.goal_features import feature_layout, goal_offsets, privileged_features, side_ahead
+from mujoban_controller.goal_rewards import GoalReward, fallen
+from mujoban_controller.goal_settings import GoalTaskConfig
+from mujoban_controller.instructions import TerminationNoise, feasible_kinds, random_instruction
+from mujoban_core.grid import DIFFICULTIES, INSTRUCTION_LIMIT, Instruction
 from mujoban_core.interfaces import ControllerInput, Planner, put_rows, take_rows
+from mujoban_rl.engine import State
 from mujoban_sim.driving import forward_speed
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.presets import DEFAULT_WORLD, get_world
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
-from mujoban_sokoban.levels import LevelError
+from mujoban_sokoban.levels import Level, LevelError
 
 EpisodeSource = Callable[[], EpisodeSpec]
 """Yields the next episode to play."""
-_BACKWARDS = -0.05
-"""Speed in cells per second below which a robot counts as moving backwards."""
+LOOK_AGAIN = 30
+"""Ticks after which a robot with several fronts chooses again which one it puts ahead, unless it pushes."""
+_NO_PLAN = 200
+"""Ticks in a row without a plan after which a planned episode is given up: the level cannot be solved any more."""
+_ENDLESS = 2.0**62
+"""Steps that no episode has; checkpoints hold finite numbers alone."""
+_CHANGING = (
+    "instruction", "terminated", "first", "planned", "torque", "side", "_without_plan", "_start_boxes", "_failures",
+    "_completed", "_horizon",
+)  # fmt: skip
+"""The task's own arrays that change from tick to tick."""
 _REMEMBERED = 256
 """Failures that are kept to be tried again."""
-
-
-@dataclass(frozen=True)
-class GoalTaskConfig:
-    """Settings of the goal task."""
-
-    batch: int = 64
-    """B, robots."""
-    body: str = "ball"
-    world: str = DEFAULT_WORLD
-    """The physical world: reference or eased."""
-    difficulty: int = 5
-    tolerance: float = 0.08
-    """Completion tolerance in cells; tighter than the paper's 0.1, so that evaluation leaves a margin."""
-    planned: float = 0.6
-    """Share of episodes that follow the planner."""
-    astray: float = 0.06
-    """Chance that a random instruction takes the place of a planned one."""
-    horizon: float = 200.0
-    """Mean steps of an episode, exponentially distributed. Short ones show more levels and appearances, without
-    which a camera policy knows the 64 warehouses that it is in by heart; `inf` goes on until the level is solved."""
-    retry: float = 0.0
-    """Share of episodes that begin where a feasible instruction failed before, in the same appearance. Failures get
-    rare long before they are few enough, and the same one then comes again and again in the level that has it."""
-    patience: int = 3
-    """Instructions that fail in a row before the episode is given up, since a jammed box stays jammed."""
-    misaligned: float = 0.5
-    """Share of episodes that begin with robot and boxes off the centres of their cells."""
-    robot_offset: float = 0.25
-    box_offset: float = 0.1
-    """Largest such offsets in cells; boxes move along one axis only, across it by less than half of that."""
-    completed_reward: float = 4.0
-    failed_reward: float = -5.0
-    backwards_penalty: float = 0.02
-    """Cost of a step in which the robot moves backwards. Tiny: after a push it has to back up before it turns."""
-    drift_penalty: float = 10.0
-    """Cost of each cell by which boxes leave the middle of their lanes."""
-    instructions: InstructionConfig = field(default_factory=InstructionConfig)
-    terminations: TerminationConfig = field(default_factory=TerminationConfig)
-
-    def __post_init__(self) -> None:
-        """Reject settings that contradict each other."""
-        get_world(self.world)
-        if not self.horizon > 0:
-            raise ValueError(f"horizon {self.horizon}: expected a positive number of steps")
-        if not 0.0 <= self.retry <= 1.0:
-            raise ValueError(f"retry {self.retry}: expected a share between 0 and 1")
-        if self.difficulty not in DIFFICULTIES:
-            raise ValueError(f"difficulty {self.difficulty}: expected one of {sorted(DIFFICULTIES)}")
-        if not 0.0 < self.tolerance <= COMPLETION_TOLERANCE:
-            raise ValueError(f"tolerance {self.tolerance}: expected at most the evaluation's {COMPLETION_TOLERANCE}")
-
-
-def judging_config(
-    batch: int, body: str = "ball", difficulty: int = 5, *, world: str = DEFAULT_WORLD, plans: bool = True
-) -> GoalTaskConfig:
-    """Return the settings under which controllers are judged: exact signals and the planner's instructions.
-
-    Without `plans` they are random ones of every kind, and an episode ends after 1,000 steps on average.
-    """
-    return GoalTaskConfig(
-        batch=batch,
-        body=body,
-        world=world,
-        difficulty=difficulty,
-        tolerance=COMPLETION_TOLERANCE,
-        planned=float(plans),
-        astray=0.0,
-        horizon=math.inf if plans else 1000.0,
-        misaligned=0.0,
-        patience=12,
-        instructions=InstructionConfig(stay=0.1, infeasible=0.2),
-        terminations=EXACT,
-    )
 
 
 class Outcome(NamedTuple):
@@ -151,32 +81,12 @@ class TaskStep(NamedTuple):
     """[B]."""
     discount: NDArray[np.float32]
     """0 where an instruction failed or the episode ended, else 1, [B]."""
+    truncated: NDArray[np.bool_]
+    """Where the episode ended without a failure, [B]: its discount is 0 although there was more to come."""
     outcomes: list[Outcome]
     """Instructions that ended."""
     episodes: list[EpisodeEnd]
     """Episodes that ended."""
-
-
-def goal_reward(
-    config: GoalTaskConfig,
-    completed: NDArray[np.bool_],
-    failed: NDArray[np.bool_],
-    drifted: NDArray[np.float64],
-    forward: NDArray[np.floating],
-) -> NDArray[np.float32]:
-    """Return the reward of one step (paper C.3), [B].
-
-    Args:
-        config: Rewards and penalties.
-        completed: Where an instruction ended with this step, and is completed, [B].
-        failed: Where one ran out of time with it, [B].
-        drifted: By how much more than before boxes stand off the middle of their lanes, in cells, [B].
-        forward: Speed along the heading behind the step in cells per second, [B].
-    """
-    reward = config.completed_reward * completed + config.failed_reward * failed
-    reward -= config.drift_penalty * np.maximum(drifted, 0.0)
-    reward -= config.backwards_penalty * (forward < _BACKWARDS)
-    return reward.astype(np.float32)
 
 
 class GoalTask:
@@ -188,6 +98,8 @@ class GoalTask:
         terminated: beta_t, bool [B].
         first: Whether tick t is the first of an episode, bool [B].
         planned: Whether the row follows the planner, bool [B].
+        torque: Applied in the tick before, zero on an episode's first, float32 [B, U].
+        side: The side that each robot puts ahead, in quarter turns to the left, int64 [B].
     """
 
     def __init__(
@@ -225,13 +137,19 @@ class GoalTask:
         self.terminated = np.zeros(b, np.bool_)
         self.first = np.ones(b, np.bool_)
         self.planned = np.zeros(b, np.bool_)
+        self.torque = np.zeros((b, self.world.body.action_size), np.float32)
+        self.side = np.zeros(b, np.int64)
+        self._layout = feature_layout(self.world.body)
+        self._reward = GoalReward(config.reward)
+        self._without_plan = np.zeros(b, np.int64)
         self._start_boxes = self.world.box_cell.copy()
         self._failures = np.zeros(b, np.int64)
         self._failed_at: deque[EpisodeSpec] = deque(maxlen=_REMEMBERED)
         self._completed = np.zeros(b, np.bool_)
-        self._horizon = np.full(b, math.inf)
+        self._horizon = np.full(b, _ENDLESS)
         self._begin_episodes(np.arange(b))
         self._issue(np.arange(b))
+        self._turn_sides(np.arange(b))
 
     @property
     def elapsed(self) -> NDArray[np.float64]:
@@ -243,6 +161,49 @@ class GoalTask:
         """Speed along the heading in cells per second, [B]."""
         return forward_speed(self.world.pose, self.world.velocity, self.world.body.cell_size)
 
+    def state(self) -> State:
+        """Return all that decides how the task goes on."""
+        world = self.world.snapshot(np.arange(self.world.batch))
+        arrays = {
+            **{f"world/{name}": values for name, values in world.items()},
+            **{f"task/{name}": getattr(self, name) for name in _CHANGING},
+            **{f"noise/{name}": values for name, values in self._noise.arrays().items()},
+            **{f"planner/{i}": values for i, values in enumerate(self._memory)},
+        }
+        failed_at = [(spec.level.to_text(), spec.seed) for spec in self._failed_at]
+        return State(
+            {"rng": self._rng.bit_generator.state, "failed_at": failed_at},
+            {name: torch.from_numpy(np.array(values)) for name, values in arrays.items()},
+        )
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._rng.bit_generator.state = state.values["rng"]
+        self._failed_at.clear()
+        self._failed_at.extend(EpisodeSpec(Level.from_text(text), seed) for text, seed in state.values["failed_at"])
+
+        def part(name: str) -> dict[str, NDArray[Any]]:
+            found = {k: v.numpy() for k, v in state.tensors.items() if k.startswith(f"{name}/")}
+            return {k.removeprefix(f"{name}/"): v for k, v in found.items()}
+
+        self.world.restore(np.arange(self.world.batch), part("world"))
+        for name, values in part("task").items():
+            setattr(self, name, values.copy())
+        for name, values in self._noise.arrays().items():
+            values[:] = part("noise")[name]
+        memory = part("planner")
+        self._memory = tuple(memory[str(i)].copy() for i in range(len(memory)))
+
+    def features(self) -> NDArray[np.float32]:
+        """Return what critic and privileged teacher see, [B, D]."""
+        return privileged_features(self.world, self.elapsed, self.torque, self.side)
+
+    def torque_of(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the torques, [B, U], of actions in the order in which the side ahead sees them, [B, U]."""
+        torque = np.empty_like(action)
+        np.put_along_axis(torque, self._layout.actuators[self.side], action, 1)
+        return torque
+
     def observe(self, *, camera: bool = True) -> ControllerInput:
         """Return what controllers see in this tick, ground truth included; without `camera` frames are empty."""
         world, b = self.world, self.world.batch
@@ -253,24 +214,31 @@ class GoalTask:
             self.instruction.copy(), frame, world.proprio.copy(), self.terminated.copy(), truth
         )
 
+    def action_of(self, torque: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return torques, [B, U], in the order in which the side ahead sees them."""
+        return np.take_along_axis(torque, self._layout.actuators[self.side], 1)
+
     def step(self, torque: NDArray[np.float32]) -> TaskStep:
         """Apply torques in [-1, 1], [B, U]; then end instructions and episodes and choose the next ones."""
         world, config = self.world, self.config
-        before = drift(world)
+        before, change = self._reward.before(world), torque - self.torque
         world.step(torque)
-        completed = world.completed.copy()
-        ended = self._noise.step(completed, self._distance()) | world.done
-        failed = ended & ~completed & (self._noise.elapsed >= config.terminations.limit)
-        reward = goal_reward(config, ended & completed, failed, drift(world) - before, self.forward_speed)
+        self.torque = np.array(torque, np.float32)
+        completed, lying = world.completed.copy(), fallen(world)
+        ended = self._noise.step(completed, self._distance()) | world.done | lying
+        beyond = self._beyond(completed)
+        ended |= beyond
+        failed = ended & ~completed & ((self._noise.elapsed >= config.terminations.limit) | beyond) | lying
+        reward = self._reward.after(world, before, change, ended & completed, failed)
         if config.retry > 0.0:
             self._remember(np.flatnonzero(failed & (world.goals.kind != GoalKind.HOLD)))
         rows = np.flatnonzero(ended)
         # An instruction that the end of its episode cut short says nothing.
         judged = np.flatnonzero(ended & (completed | failed))
-        outcomes = [self._outcome(b, bool(completed[b])) for b in judged.tolist()]
+        outcomes = [self._outcome(b, bool(completed[b] and not failed[b])) for b in judged.tolist()]
         self._failures = np.where(failed, self._failures + 1, np.where(ended, 0, self._failures))
-        over = world.done | (ended & (world.steps >= self._horizon))
-        over |= self._failures >= config.patience
+        given_up = (self._failures >= config.patience) | (self._without_plan >= _NO_PLAN)
+        over = world.done | lying | (ended & ((world.steps >= self._horizon) | given_up))
         self._completed = completed & ~over
         episodes = [self._episode_end(b) for b in np.flatnonzero(over).tolist()]
         self.terminated, self.first = ended & ~over, over
@@ -278,7 +246,26 @@ class GoalTask:
             self._begin_episodes(np.flatnonzero(over))
         if rows.size:
             self._issue(rows)
-        return TaskStep(reward, (~(failed | over)).astype(np.float32), outcomes, episodes)
+        self._turn_sides(rows)
+        return TaskStep(reward, (~(failed | over)).astype(np.float32), over & ~failed, outcomes, episodes)
+
+    def _beyond(self, completed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return where a pushed box is past its target for good, [B]."""
+        if self.config.overshoot == math.inf:
+            return np.zeros_like(completed)
+        world, goals = self.world, self.world.goals
+        left = goal_offsets(world)[:, 2:]
+        resting = world.box_speed[np.arange(world.batch), goals.box_index] < 0.05 * world.body.cell_size
+        stuck = (left[:, 0] < -0.02) & (np.hypot(*left.T) > self.config.tolerance) & resting
+        return (goals.kind == GoalKind.PUSH) & ((left[:, 0] < -self.config.overshoot) | stuck) & ~completed
+
+    def _turn_sides(self, issued: NDArray[np.int64]) -> None:
+        """Choose the side ahead where an instruction is new, or has lasted for long and is no push."""
+        elapsed = self._noise.elapsed
+        again = (elapsed > 0) & (elapsed % LOOK_AGAIN == 0) & (self.world.goals.kind != GoalKind.PUSH)
+        again[issued] = True
+        if again.any():
+            self.side = np.where(again, side_ahead(self.world), self.side)
 
     def _remember(self, rows: NDArray[np.int64]) -> None:
         """Keep the situations in which the instructions in force began, to be tried again."""
@@ -333,7 +320,8 @@ class GoalTask:
     def _begin_episodes(self, rows: NDArray[np.int64]) -> None:
         config, rng = self.config, self._rng
         self.world.reset(rows, [self._next_episode() for _ in rows])
-        self._failures[rows] = 0
+        self._failures[rows] = self._without_plan[rows] = 0
+        self.torque[rows] = 0.0
         if config.horizon < math.inf:
             self._horizon[rows] = rng.exponential(config.horizon, len(rows))
         self.planned[rows] = rng.random(len(rows)) < config.planned
@@ -347,10 +335,11 @@ class GoalTask:
         config, rng, world = self.config, self._rng, self.world
         size, m, k = world.body.cell_size, len(rows), world.max_boxes
         pose = world.pose[rows].astype(np.float64)
-        pose[:, :2] += rng.uniform(-1, 1, (m, 2)) * config.robot_offset * size
-        # A box that is off along both axes would overlap a peg.
-        lopsided = np.where(rng.random((m, k, 1)) < 0.5, [[1.0, 0.4]], [[0.4, 1.0]])
-        boxes = world.box_position[rows] + rng.uniform(-1, 1, (m, k, 2)) * lopsided * config.box_offset * size
+        # What is off along both axes would overlap a peg.
+        lopsided = np.where(rng.random((m, k + 1, 1)) < 0.5, [[1.0, 0.4]], [[0.4, 1.0]])
+        offset = rng.uniform(-1, 1, (m, k + 1, 2)) * lopsided * size
+        pose[:, :2] += offset[:, 0] * config.robot_offset
+        boxes = world.box_position[rows] + offset[:, 1:] * config.box_offset
         world.place(rows, pose, boxes)
 
     def _issue(self, rows: NDArray[np.int64]) -> None:
@@ -364,6 +353,7 @@ class GoalTask:
             state = world.abstract_state()[planned]
             decided, memory = self._planner.decide(state, take_rows(self._memory, planned))
             self.instruction[planned] = decided
+            self._without_plan[planned] = np.where(decided == Instruction.STAY, self._without_plan[planned] + 1, 0)
             self._memory = put_rows(self._memory, planned, memory) if self._memory else ()
             if self.config.planned < 1.0:
                 # No plan is left: the planner stays, the row goes on at random.

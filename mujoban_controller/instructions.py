@@ -9,6 +9,7 @@ Shapes: B robots, M selected rows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +104,10 @@ class TerminationNoise:
         self._completed = np.zeros(batch, np.int64)
         self.elapsed = np.zeros(batch, np.int64)
         """Ticks since the instruction in force was issued, [B]."""
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays that change, by name; they are live."""
+        return {"delay": self._delay, "margin": self._margin, "completed": self._completed, "elapsed": self.elapsed}
 
     def issue(self, rows: NDArray[np.int64]) -> None:
         """Draw how the signals for new instructions in the given rows, [M], will come."""

@@ -7,21 +7,22 @@ judged by the levels that they solve under a solver's plans, and failures are to
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from mujoban_controller.drivers import ControllerDriver, Driver
-from mujoban_controller.goal_task import EpisodeEnd, GoalTask, Outcome, judging_config
+from mujoban_controller.episodes import SeededEpisodes
+from mujoban_controller.goal_settings import judging_config
+from mujoban_controller.goal_task import EpisodeEnd, GoalTask, Outcome
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import Controller, Planner
 from mujoban_core.stats import wilson_interval
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.presets import DEFAULT_WORLD
-from mujoban_sokoban.episodes import EpisodeSpec
-from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_level
+from mujoban_sokoban.generator import VALIDATION_SEEDS
 
 
 def kind_name(outcome: Outcome) -> str:
@@ -81,19 +82,15 @@ class OutcomeSummary:
         failures = dict(self.failures)
         return {"kinds": kinds, "feasible": together, "failures": failures, "displaced": self.displaced}
 
-
-class SeededEpisodes:
-    """Episodes of consecutive seeds at one difficulty."""
-
-    def __init__(self, difficulty: int, first_seed: int) -> None:
-        """Start with the level of `first_seed`."""
-        self._difficulty = difficulty
-        self._seeds: Iterator[int] = iter(range(first_seed, first_seed + 2**40))
-
-    def __call__(self) -> EpisodeSpec:
-        """Return the next episode."""
-        seed = next(self._seeds)
-        return EpisodeSpec(generate_level(self._difficulty, seed), seed)
+    def scalars(self) -> dict[str, float]:
+        """Return rates and durations by kind, for a log."""
+        values: dict[str, float] = {}
+        for kind, entry in self.report()["kinds"].items():
+            values[f"instruction/{kind}"] = entry["success_rate"]
+            values[f"instruction/{kind}_n"] = entry["n"]
+            if entry["median_steps"] is not None:
+                values[f"steps/{kind}"] = entry["median_steps"]
+        return values
 
 
 def judge(

@@ -1,9 +1,9 @@
-"""MPO in the goal task: a privileged policy, or the camera policy with an asymmetric critic (paper C.3).
+"""MPO in the goal task: a privileged teacher, or the camera policy with an asymmetric critic (paper C.3).
 
-Both run on sequences from a replay. The camera policy's recurrent state at the start of a sequence is the one
-that it had when the sequence was played.
+Both learn from windows of a replay. The camera policy's memory at the start of a window is the one that it had when
+the window was played. The critic sees the privileged features, and actions as the side ahead sees them.
 
-Shapes: B robots, T ticks, M sequences in a batch, N sampled actions, U actuators, D privileged features.
+Shapes: M windows of a batch, W ticks of a window, n steps of a return, N sampled actions, U actuators, D features.
 """
 
 from __future__ import annotations
@@ -11,43 +11,47 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.controller import Gaussian, Recurrent, VisuomotorController
-from mujoban_controller.goal_features import privileged_features
-from mujoban_controller.goal_task import GoalTask, TaskStep
+from mujoban_controller.controller import Gaussian, VisuomotorController
+from mujoban_controller.goal_features import feature_layout
+from mujoban_controller.play import INPUT_FIELDS, Batch, memory_of
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
-from mujoban_controller.replay import SequenceReplay, memory_fields
-from mujoban_core.interfaces import Memory, renew_rows
+from mujoban_controller.product import ProductLearner, Validation
+from mujoban_core.bodies import get_body
+from mujoban_rl.engine import Scalars, State
+from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
 from mujoban_rl.losses.returns import td_target
+from mujoban_rl.optimise import guarded_step
 
 Policy = PrivilegedPolicy | VisuomotorController
 
 
 @dataclass(frozen=True)
 class MPOTrainingConfig:
-    """Settings of MPO in the goal task; those of Acme (Hoffman et al. 2020)."""
+    """Settings of MPO in the goal task; where not said otherwise those of Acme."""
 
-    length: int = 16
-    """T, ticks of a sequence."""
-    sequences: int = 24
-    """M, sequences of a batch."""
-    replay: int = 40_000
-    """Sequences in the replay."""
+    window: int = 6
+    """W; the policy learns in the ticks from n on, the critic in as many from the first on."""
+    windows: int = 256
+    """M."""
+    sequence: int = 32
+    """Ticks of a sequence in the replay, at least W."""
+    replay: int = 500_000
+    """Environment steps in the replay."""
+    first: int = 10_000
+    """Environment steps before the first update."""
     reuse: float = 4.0
-    """Times that each frame is trained on, on average."""
+    """Times that each step is learned from, on average."""
     n_step: int = 5
     samples: int = 20
     """N."""
-    gamma: float = 0.99
+    gamma: float = 0.98
     target_period: int = 100
     """Updates between copies to the target networks."""
     policy_rate: float = 3e-4
@@ -55,132 +59,144 @@ class MPOTrainingConfig:
     clip: float = 40.0
     critic_first: int = 0
     """Updates in which the critic learns alone; a policy that is good already needs it."""
+    normalised: int = 2_000
+    """Updates after which the normalisation of features stays as it is."""
     loss: MPOConfig = field(default_factory=MPOConfig)
 
+    @property
+    def skipped(self) -> int:
+        """Ticks of a window in which nothing is learned."""
+        return self.n_step
+
     def __post_init__(self) -> None:
-        """Reject sequences that hold no n-step return."""
-        if self.length <= self.n_step:
-            raise ValueError(f"length {self.length}: expected more ticks than n_step {self.n_step}")
+        """Reject windows that hold no n-step return, or that no sequence holds."""
+        if self.sequence < self.window:
+            raise ValueError(f"sequence {self.sequence}: expected at least the ticks of a window, {self.window}")
+        if self.window <= self.n_step:
+            raise ValueError(f"window {self.window}: expected more ticks than n_step {self.n_step}")
 
 
 def policy_over(policy: Policy, batch: Mapping[str, Tensor]) -> Gaussian:
-    """Return the policy's distributions along sequences, [M, T, U]."""
+    """Return the policy's distributions along windows, [M, W, U]."""
     if isinstance(policy, PrivilegedPolicy):
-        return policy(batch["state"])
-    memory = Recurrent(*(batch[f"memory{i}"] for i in range(3)))
-    inputs = (batch[k] for k in ("frame", "proprio", "instruction", "terminated"))
-    return policy(*inputs, memory, batch["first"]).action
+        return policy(batch["features"])
+    return policy(*(batch[k] for k in INPUT_FIELDS), memory_of(batch), batch["first"]).action
 
 
-class MPOCollector:
-    """Lets the policy act with exploration in the goal task."""
+class MPOLearner(ProductLearner[Batch]):
+    """Online and target networks, and dual variables."""
 
-    def __init__(self, task: GoalTask, policy: Policy, length: int, generator: torch.Generator) -> None:
-        """Collect sequences of `length` ticks."""
-        self.task, self.policy, self.length, self._generator = task, policy, length, generator
-        self._memory: Memory = ()
-        if isinstance(policy, VisuomotorController):
-            self._memory = policy.initial_memory(task.world.batch)
-
-    def collect(self) -> tuple[dict[str, NDArray], dict[str, NDArray], list[TaskStep]]:
-        """Play T ticks; return per-tick fields [T, B, ...], the memory at the start, and what happened."""
-        starts = memory_fields(self._memory)
-        ticks, steps = [], []
-        for _ in range(self.length):
-            tick, outcome = self._tick()
-            ticks.append(tick)
-            steps.append(outcome)
-        return {k: np.stack([t[k] for t in ticks]) for k in ticks[0]}, starts, steps
-
-    @torch.inference_mode()
-    def _tick(self) -> tuple[dict[str, Any], TaskStep]:
-        task, first = self.task, self.task.first.copy()
-        tick: dict[str, Any] = {"state": privileged_features(task.world, task.elapsed), "first": first}
-        if isinstance(self.policy, VisuomotorController):
-            fresh = self.policy.initial_memory(len(first))
-            inputs = task.observe()
-            memory = renew_rows(self._memory, fresh, first)
-            output = self.policy(*self.policy.to_tensors(inputs), memory=Recurrent(*memory))
-            self._memory = output.memory
-            action = Gaussian(output.action.mean[:, 0], output.action.scale[:, 0])
-            fields = ("frame", "proprio", "instruction", "terminated")
-            tick |= {name: getattr(inputs, name) for name in fields}
-        else:
-            action = self.policy(torch.from_numpy(tick["state"]))
-        torque = action.sample(self._generator).clamp(-1.0, 1.0).numpy()
-        result = task.step(torque)
-        return {**tick, "action": torque, "reward": result.reward, "discount": result.discount}, result
-
-
-class MPOLearner:
-    """Online and target networks, dual variables and optimisers; one `update` per batch."""
-
-    def __init__(self, policy: Policy, body: str, config: MPOTrainingConfig, generator: torch.Generator) -> None:
-        """Train `policy` in place."""
+    def __init__(
+        self,
+        policy: Policy,
+        body: str,
+        config: MPOTrainingConfig,
+        generator: torch.Generator,
+        validation: Validation | None = None,
+    ) -> None:
+        """Train `policy` in place; `generator` draws the actions of the E-step."""
+        super().__init__(validation or Validation())
         self.policy, self.config, self._generator = policy, config, generator
         self.critic = Critic(body)
         self.loss = MPOLoss(policy.action_size, config.loss)
         self.target_policy, self.target_critic = deepcopy(policy), deepcopy(self.critic)
-        self.policy_optimiser = torch.optim.Adam(policy.parameters(), config.policy_rate)
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate)
-        self.dual_optimiser = self.loss.duals.adam(config.loss.dual_learning_rate)
-        self.updates = 0
+        self._actuators = torch.from_numpy(feature_layout(get_body(body)).actuators)
+        self._policy_adam = torch.optim.Adam(policy.parameters(), config.policy_rate)
+        self._critic_adam = torch.optim.Adam(self.critic.parameters(), config.critic_rate)
+        self._dual_adam = self.loss.duals.adam(config.loss.dual_learning_rate)
+        self._updates = 0
 
-    def update(self, replay: SequenceReplay, rng: np.random.Generator) -> dict[str, Tensor]:
-        """Take one gradient step of critic and policy; return statistics."""
+    @property
+    def product(self) -> Policy:
+        """The online policy."""
+        return self.policy
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """Online and target networks and the dual variables."""
+        return {
+            "policy": self.policy, "critic": self.critic, "duals": self.loss,
+            "target_policy": self.target_policy, "target_critic": self.target_critic,
+        }  # fmt: skip
+
+    @property
+    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """Those of policy, critic and dual variables."""
+        return {"policy": self._policy_adam, "critic": self._critic_adam, "duals": self._dual_adam}
+
+    def own_state(self) -> State:
+        """Return the random state and the number of updates, on which the targets' copies depend."""
+        return State({"updates": self._updates}, {"generator": self._generator.get_state()})
+
+    def restore_own(self, state: State) -> None:
+        """Take over what `own_state` returned."""
+        self._updates = state.values["updates"]
+        self._generator.set_state(state.tensors["generator"])
+
+    def weights(self) -> Mapping[str, Tensor]:
+        """Return the online policy's."""
+        return self.policy.state_dict()
+
+    def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
+        """Take one step of the critic, and one of the policy unless the batch was refused."""
         config = self.config
-        batch = replay.sample(config.sequences, rng, next(self.policy.parameters()).device)
         with torch.no_grad():
             target = policy_over(self.target_policy, batch)
-            noise = torch.randn(
-                (config.samples, *target.mean.shape), generator=self._generator, device=target.mean.device
-            )
-            # Shapes [N, M, T, U] and [N, M, T].
-            action = target.mean + target.scale * noise
-            q = self.target_critic(batch["state"], action)
-        stats = {"loss/critic": self._update_critic(batch, q.mean(0))}
-        if self.updates >= config.critic_first:
-            stats |= self._update_policy(batch, target, action, q)
-        self.updates += 1
-        if self.updates % config.target_period == 0:
+            noise = torch.randn((config.samples, *target.mean[:, config.n_step :].shape), generator=self._generator)
+            late = Gaussian(target.mean[:, config.n_step :], target.scale[:, config.n_step :])
+            # Shapes [N, M, W - n, U] and [N, M, W - n].
+            action = late.mean + late.scale * noise
+            q = self.target_critic(batch["features"][:, config.n_step :], self._as_seen(action, batch))
+        loss = self._critic_loss(batch, q.mean(0))
+        stats = {"loss/critic": float(loss.detach())}
+        accepted = guarded_step(loss, [self._critic_adam], guard, clip=config.clip) is not None
+        if accepted and self._updates >= config.critic_first:
+            stats |= self._update_policy(batch, late, action, q, guard)
+        if accepted and self._updates < config.normalised:
+            self._normalise(batch)
+        self._updates += accepted
+        if accepted and self._updates % config.target_period == 0:
             self.target_policy.load_state_dict(self.policy.state_dict())
             self.target_critic.load_state_dict(self.critic.state_dict())
         return stats
 
-    def _update_critic(self, batch: Mapping[str, Tensor], value: Tensor) -> Tensor:
-        n, length = self.config.n_step, self.config.length
-        starts = length - n
-        # Shape [M, T - n, n].
+    def _normalise(self, batch: Mapping[str, Tensor]) -> None:
+        """Take in what is seen, for online and target networks alike: what they compute would differ otherwise."""
+        features = batch["features"].flatten(0, 1)
+        for module in (self.critic, self.target_critic, self.policy, self.target_policy):
+            if not isinstance(module, VisuomotorController):
+                module.normaliser.update(features)
+            elif not module.fitted:
+                module.fit_normalisation(batch["proprio"].flatten(0, 1))
+
+    def _as_seen(self, action: Tensor, batch: Mapping[str, Tensor]) -> Tensor:
+        """Return a policy's actions in the last W - n ticks as the side ahead sees them, [N, M, W - n, U]."""
+        if isinstance(self.policy, PrivilegedPolicy) or len(self._actuators) == 1:
+            return action
+        order = self._actuators[batch["side"][:, self.config.n_step :]]
+        return action.gather(-1, order.expand(action.shape))
+
+    def _critic_loss(self, batch: Mapping[str, Tensor], value: Tensor) -> Tensor:
+        """Return the squared error of Q in the first W - n ticks, given V in the last W - n, [M, W - n]."""
+        n = self.config.n_step
+        starts = value.shape[1]
+        # Shape [M * (W - n), n].
         reward, discount = (batch[k].unfold(1, n, 1)[:, :starts].flatten(0, 1) for k in ("reward", "discount"))
-        target = td_target(reward, discount, value[:, n:].flatten(), self.config.gamma)
-        predicted = self.critic(batch["state"][:, :starts], batch["action"][:, :starts]).flatten()
-        loss = functional.mse_loss(predicted, target)
-        self.critic_optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        self._step(self.critic, self.critic_optimiser)
-        return loss.detach()
+        target = td_target(reward, discount, value.flatten(), self.config.gamma)
+        predicted = self.critic(batch["features"][:, :starts], batch["action"][:, :starts]).flatten()
+        return functional.mse_loss(predicted, target)
 
     def _update_policy(
-        self, batch: Mapping[str, Tensor], target: Gaussian, action: Tensor, q: Tensor
-    ) -> dict[str, Tensor]:
+        self, batch: Batch, target: Gaussian, action: Tensor, q: Tensor, guard: NaNGuard
+    ) -> dict[str, float]:
         online = policy_over(self.policy, batch)
+        n = self.config.n_step
         loss, stats = self.loss(
-            (online.mean.flatten(0, 1), online.scale.flatten(0, 1)),
+            (online.mean[:, n:].flatten(0, 1), online.scale[:, n:].flatten(0, 1)),
             (target.mean.flatten(0, 1), target.scale.flatten(0, 1)),
             action.flatten(1, 2),
             q.flatten(1),
         )
-        self.policy_optimiser.zero_grad(set_to_none=True)
-        self.dual_optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = self._step(self.policy, self.policy_optimiser)
-        self.dual_optimiser.step()
-        named = {name: torch.tensor(value) for name, value in scalars(stats._asdict()).items()}
-        return {**named, "gradient_norm": norm}
-
-    def _step(self, module: nn.Module, optimiser: torch.optim.Optimizer) -> Tensor:
-        """Apply the gradients unless they are not finite; return their norm."""
-        norm = nn.utils.clip_grad_norm_(module.parameters(), self.config.clip)
-        if bool(torch.isfinite(norm)):
-            optimiser.step()
-        return norm
+        norm = guarded_step(loss, [self._policy_adam, self._dual_adam], guard, clip=self.config.clip)
+        named = scalars(stats._asdict())
+        return named if norm is None else {**named, "gradient_norm": float(norm)}

@@ -1,54 +1,126 @@
-"""Networks that see the privileged features of `mujoban_controller.goal_features`: the critic and a teacher.
+"""Networks that see the privileged features of `mujoban_controller.goal_features`: teacher, values, critic.
 
-Shapes: D features, U actuators; `...` any leading axes, such as samples, sequences and ticks.
+All of them normalise what they see by the mean and deviation of the features met so far.
+
+Shapes: D features, U actuators, M samples; `...` any leading axes, such as samples, sequences and ticks.
 """
 
 from __future__ import annotations
+
+import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.controller import Gaussian, gaussian, gaussian_layers
-from mujoban_controller.goal_features import feature_size
+from mujoban_controller.controller import Gaussian
+from mujoban_controller.goal_features import feature_layout
 from mujoban_core.bodies import get_body
+
+_CLIP = 5.0
+_LEAST_SCALE, _LARGEST_SCALE = 0.08, 1.6
+
+
+class Normaliser(nn.Module):
+    """Scales features to mean 0 and deviation 1 of the samples that `update` has seen."""
+
+    mean: Tensor
+    variance: Tensor
+    count: Tensor
+
+    def __init__(self, size: int) -> None:
+        """Begin as the identity."""
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("variance", torch.ones(size))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, features: Tensor) -> None:
+        """Take in samples, [M, D]."""
+        x = features.double()
+        total = self.count + len(x)
+        delta = x.mean(0) - self.mean
+        spread = self.variance * self.count + x.var(0, unbiased=False) * len(x)
+        spread = spread + delta.square() * self.count * len(x) / total
+        self.mean.add_((delta * len(x) / total).float())
+        self.variance.copy_(spread / total)
+        self.count.copy_(total)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return normalised features, [..., D]."""
+        return ((features - self.mean) / (self.variance + 1e-4).sqrt()).clamp(-_CLIP, _CLIP)
+
+
+def _layers(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
+    """Return fully connected layers with ELU between, orthogonal as PPO likes them."""
+    layers: list[nn.Module] = []
+    for i, (inputs, outputs) in enumerate(pairwise(sizes)):
+        linear = nn.Linear(inputs, outputs)
+        nn.init.orthogonal_(linear.weight, last_gain if i == len(sizes) - 2 else math.sqrt(2))
+        nn.init.zeros_(linear.bias)
+        layers += [linear, nn.ELU()]
+    return nn.Sequential(*layers[:-1])
 
 
 class PrivilegedPolicy(nn.Module):
-    """Policy over torques from privileged features; the teacher that MPO trains on small machines."""
+    """Policy over torques, as the side ahead sees them, from privileged features; the teacher of the camera policy."""
 
-    def __init__(self, body: str = "ball", width: int = 256) -> None:
+    def __init__(self, body: str = "ball", width: int = 128, scale: float = 0.4) -> None:
+        """Build the network.
+
+        Args:
+            body: Key in `mujoban_core.bodies.BODIES`.
+            width: Of its two hidden layers.
+            scale: Standard deviation of every action before training; the same in all states.
+        """
+        super().__init__()
+        layout = feature_layout(get_body(body))
+        self.config = {"body": body, "width": width, "scale": scale}
+        self.action_size = layout.actuators.shape[1]
+        self.normaliser = Normaliser(layout.size)
+        self.layers = _layers((layout.size, width, width, self.action_size), 0.01)
+        self.log_scale = nn.Parameter(torch.full((self.action_size,), math.log(scale)))
+
+    def forward(self, features: Tensor) -> Gaussian:
+        """Return the distribution over actions, [..., U], given features [..., D]."""
+        mean = self.layers(self.normaliser(features))
+        scale = self.log_scale.clamp(math.log(_LEAST_SCALE), math.log(_LARGEST_SCALE)).exp()
+        return Gaussian(mean, scale.expand_as(mean))
+
+
+class Value(nn.Module):
+    """Expected return of privileged features."""
+
+    def __init__(self, body: str = "ball", width: int = 128) -> None:
         """Build the network for a body."""
         super().__init__()
-        self.config = {"body": body, "width": width}
-        layout = get_body(body)
-        self.trunk = nn.Sequential(
-            nn.Linear(feature_size(layout.proprio_size), width), nn.LayerNorm(width), nn.Tanh(),
-            nn.Linear(width, width), nn.ELU(),
-        )  # fmt: skip
-        self.action_size = layout.action_size
-        self.mean, self.scale = gaussian_layers(width, layout.action_size)
+        size = feature_layout(get_body(body)).size
+        self.normaliser = Normaliser(size)
+        self.layers = _layers((size, width, width, 1), 1.0)
 
-    def forward(self, state: Tensor) -> Gaussian:
-        """Return the distribution over torques, [..., U], given features [..., D]."""
-        x = self.trunk(state)
-        return gaussian(self.mean(x), self.scale(x))
+    def forward(self, features: Tensor) -> Tensor:
+        """Return V, [...], given features [..., D]."""
+        return self.layers(self.normaliser(features)).squeeze(-1)
 
 
 class Critic(nn.Module):
-    """Q of privileged features and torques (the asymmetric critic of paper C.3)."""
+    """Q of privileged features and actions as the side ahead sees them (the asymmetric critic of paper C.3)."""
 
     def __init__(self, body: str = "ball", width: int = 256) -> None:
         """Build the network for a body."""
         super().__init__()
-        layout = get_body(body)
-        self.state = nn.Linear(feature_size(layout.proprio_size), width)
-        self.action = nn.Linear(layout.action_size, width, bias=False)
+        layout = feature_layout(get_body(body))
+        self.normaliser = Normaliser(layout.size)
+        self.state = nn.Linear(layout.size, width)
+        self.action = nn.Linear(layout.actuators.shape[1], width, bias=False)
         self.norm = nn.LayerNorm(width)
         self.hidden = nn.Linear(width, width)
         self.value = nn.Linear(width, 1)
 
-    def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return Q, [...], given features [..., D] and torques [..., U], whose leading axes broadcast."""
-        x = torch.tanh(self.norm(self.state(state) + self.action(action.clamp(-1.0, 1.0))))
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return Q, [...], given features [..., D] and actions [..., U], whose leading axes broadcast."""
+        state = self.state(self.normaliser(features))
+        x = torch.tanh(self.norm(state + self.action(action.clamp(-1.0, 1.0))))
         return self.value(functional.elu(self.hidden(x))).squeeze(-1)

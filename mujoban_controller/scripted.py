@@ -1,4 +1,4 @@
-"""The scripted teacher of the ball: it knows where everything is, and its torques are what a student can imitate.
+"""The scripted teacher of the ball: it knows where everything is. A baseline, from which no shipped weight learns.
 
 It differs from the oracle of `mujoban_sim.oracles` where a student needs it to. It bends back to its lane smoothly
 instead of turning round at a distance from it: a student that is not sure on which side of such a threshold it is
@@ -48,13 +48,8 @@ class TeacherGains(SteeringGains):
 GAINS = TeacherGains()
 
 
-def scripted_driver(task: GoalTask, offset: NDArray[np.float64] | None = None) -> NDArray[np.float32]:
-    """Return the scripted teacher's torques (roll, steer), [B, 2].
-
-    Args:
-        task: Where it drives.
-        offset: Metres by which it misses its targets, [B, 2].
-    """
+def scripted_driver(task: GoalTask) -> NDArray[np.float32]:
+    """Return the scripted teacher's torques (roll, steer) in a task, [B, 2]."""
     world, goals, g = task.world, task.world.goals, GAINS
     offsets = goal_offsets(world).astype(np.float64)
     to_target = offsets[:, :2]
@@ -62,9 +57,8 @@ def scripted_driver(task: GoalTask, offset: NDArray[np.float64] | None = None) -
     # A move whose goal lies behind is over: what is left is to hold that cell.
     move = (goals.kind == GoalKind.MOVE) & (to_target[:, 0] >= -g.overshot)
     lane = OFFSETS_XY[goals.direction] * (push | move)[:, None]
-    target = goals.robot_target if offset is None else goals.robot_target + offset
     lane_gain = np.where(push, g.push_lane_gain, g.move_lane_gain)[:, None]
-    course = plot_course(target, world.pose, lane, lane_gain, g, world.body.cell_size)
+    course = plot_course(goals.robot_target, world.pose, lane, lane_gain, g, world.body.cell_size)
     left = np.where(course.recentre, course.off_lane, course.along)
     pushing = push & ~course.recentre
     wanted = np.where(pushing, push_speed(offsets[:, 2], task.forward_speed, g), g.move_braking * left)

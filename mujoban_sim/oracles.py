@@ -169,6 +169,37 @@ class DrivingGains(SteeringGains):
     """Weight of the distance from the lane in the direction to drive in."""
 
 
+def follow_goals(inputs: ControllerInput, memory: Memory, cell_size: float) -> tuple[GoalTracker, GroundTruth]:
+    """Return the goals in force, given the memory of a `GoalTracker` from the tick before, and the truth.
+
+    Every box that a goal may be about has a place in the truth that is returned; absent ones are far away.
+
+    Raises:
+        ValueError: if there is no ground truth.
+    """
+    truth = _require(inputs.truth)
+    goals = GoalTracker(len(inputs.instruction), cell_size=cell_size)
+    goals.restore(memory)
+    boxes = int(goals.box_index.max(initial=0)) + 1
+    truth = truth._replace(box_position=_with_absent(truth.box_position, boxes))
+    goals.reached[:] = truth.completed
+    issued = np.flatnonzero(inputs.terminated | (goals.kind == GoalKind.NONE))
+    if issued.size:
+        layers = truth.abstract_state
+        agent = layers[..., AGENT].reshape(len(layers), -1).argmax(-1)
+        cells = np.stack([agent // GRID_SIZE, agent % GRID_SIZE], -1)
+        boxes_at = cells_of_boxes(truth.box_position, cell_size)
+        goals.begin(issued, inputs.instruction, layers[..., WALL] > 0.5, cells, boxes_at)
+    return goals, truth
+
+
+def cells_of_boxes(position: NDArray[np.floating], cell_size: float) -> NDArray[np.int64]:
+    """Return the (row, column) of boxes, [..., K, 2], given their positions in metres; -1 for those off the grid."""
+    cells = xy_to_cell(position, cell_size)
+    cells[((cells < 0) | (cells >= GRID_SIZE)).any(-1)] = -1
+    return cells
+
+
 class OracleController(Controller):
     """A scripted driver that knows where everything is: turn, drive along the lane, reverse to recentre."""
 
@@ -184,25 +215,7 @@ class OracleController(Controller):
 
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques, [B, 2], and the goals in force."""
-        truth = _require(inputs.truth)
-        goals = GoalTracker(len(inputs.instruction), cell_size=BALL.cell_size)
-        goals.restore(state)
-        boxes = int(goals.box_index.max(initial=0)) + 1
-        truth = truth._replace(box_position=_with_absent(truth.box_position, boxes))
-        goals.reached[:] = truth.completed
-        issued = np.flatnonzero(inputs.terminated | (goals.kind == GoalKind.NONE))
-        if issued.size:
-            layers = truth.abstract_state
-            agent = layers[..., AGENT].reshape(len(layers), -1).argmax(-1)
-            boxes = xy_to_cell(truth.box_position, BALL.cell_size)
-            boxes[((boxes < 0) | (boxes >= GRID_SIZE)).any(-1)] = -1
-            goals.begin(
-                issued,
-                inputs.instruction,
-                layers[..., WALL] > 0.5,
-                np.stack([agent // GRID_SIZE, agent % GRID_SIZE], -1),
-                boxes,
-            )
+        goals, truth = follow_goals(inputs, state, BALL.cell_size)
         return drive(goals, truth, self._gains), goals.memory()
 
 

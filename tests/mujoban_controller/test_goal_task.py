@@ -7,11 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mujoban_controller.drivers import scripted_driver
-from mujoban_controller.goal_features import feature_size, privileged_features
-from mujoban_controller.goal_task import GoalTask, GoalTaskConfig, judging_config
-from mujoban_controller.judge import SeededEpisodes, judge
-from mujoban_core.grid import Instruction
+from mujoban_controller.episodes import SeededEpisodes
+from mujoban_controller.goal_features import feature_layout
+from mujoban_controller.goal_settings import GoalTaskConfig, judging_config
+from mujoban_controller.goal_task import GoalTask
+from mujoban_controller.instructions import EXACT
+from mujoban_controller.judge import judge
+from mujoban_controller.scripted import scripted_driver
+from mujoban_core.bodies import BALL
+from mujoban_core.grid import OFFSETS_XY, Instruction
 from mujoban_core.interfaces import Planner
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.oracles import OracleController, OraclePlanner
@@ -45,11 +49,13 @@ def idle(task):
 
 
 def test_a_good_driver_is_rewarded_for_each_instruction():
-    results = play(make(misaligned=0.0, horizon=np.inf), 150)
+    good, idle_task = make(misaligned=0.0, horizon=np.inf), make(misaligned=0.0, horizon=np.inf)
+    results = play(good, 200)
     outcomes = [o for r in results for o in r.outcomes]
-    assert len(outcomes) > 10
-    assert all(o.completed for o in outcomes)
-    assert sum(r.reward.sum() for r in results) == pytest.approx(4.0 * len(outcomes), abs=0.15 * len(outcomes))
+    assert len(outcomes) > 10 and all(o.completed for o in outcomes)
+    bonus = good.config.reward.completed * len(outcomes)
+    total = float(sum(r.reward.sum() for r in results))
+    assert total > bonus > 0.0 > sum(float(r.reward.sum()) for r in play(idle_task, 200, idle))
 
 
 def test_an_idle_robot_fails_moves_after_the_limit_and_is_given_up_after_some():
@@ -57,7 +63,7 @@ def test_an_idle_robot_fails_moves_after_the_limit_and_is_given_up_after_some():
     results = play(task, 240, idle)
     failures = [(t + 1, r) for t, r in enumerate(results) if r.outcomes]
     assert [t for t, _ in failures] == [120, 240]
-    assert failures[0][1].reward == pytest.approx(np.full(4, -5.0))
+    assert failures[0][1].reward == pytest.approx(np.full(4, task.config.reward.failed), abs=0.3)
     assert failures[0][1].discount.tolist() == [0.0] * 4
     assert [o.completed for o in failures[0][1].outcomes] == [False] * 4
     assert len(failures[1][1].episodes) == 4
@@ -66,7 +72,7 @@ def test_an_idle_robot_fails_moves_after_the_limit_and_is_given_up_after_some():
 
 
 def test_the_signal_comes_with_the_next_instruction_and_says_what_the_rule_said():
-    task = make(misaligned=0.0, planned=1.0, astray=0.0)
+    task = make(misaligned=0.0, planned=1.0, astray=0.0, terminations=EXACT)
     for _ in range(120):
         result = task.step(scripted_driver(task))
         inputs = task.observe(camera=False)
@@ -100,21 +106,41 @@ def test_the_same_seed_gives_the_same_task():
     assert np.array_equal(first.world.pose, second.world.pose)
 
 
+def seen_from(direction, heading, offset):
+    """Return the features of a robot `offset` (along, left) in cells off its cell, with a heading off its lane."""
+    task = make(planned=1.0, astray=0.0, misaligned=0.0, planner=Stubborn(direction), batch=8)
+    world = task.world
+    row = np.flatnonzero(world.goals.kind == GoalKind.MOVE)[0]
+    along = OFFSETS_XY[direction]
+    pose = world.pose.astype(float)
+    pose[:, :2] += offset[0] * along + offset[1] * np.array([-along[1], along[0]])
+    pose[:, 2] = np.arctan2(along[1], along[0]) + heading
+    world.place(np.arange(8), pose, world.box_position)
+    task.torque[:] = (0.3, np.sign(heading) * 0.7)
+    features = task.features()[row]
+    assert features.shape == (feature_layout(BALL).size,)
+    return features[: -len(SURROUNDINGS)]
+
+
+SURROUNDINGS = range(22)
+
+
 def test_features_do_not_depend_on_the_direction_of_the_instruction():
     # The same situation, turned by 90 degrees, looks the same to critic and teacher.
-    views = []
-    for direction, heading in ((Instruction.EAST, 0.0), (Instruction.NORTH, np.pi / 2), (Instruction.WEST, np.pi)):
-        task = make(planned=1.0, astray=0.0, misaligned=0.0, planner=Stubborn(direction), batch=8)
-        world = task.world
-        moves = np.flatnonzero(world.goals.kind == GoalKind.MOVE)
-        pose = world.pose.astype(float)
-        pose[:, 2] = heading
-        world.place(np.arange(8), pose, world.box_position)
-        features = privileged_features(world, task.elapsed)
-        assert features.shape == (8, feature_size(world.body.proprio_size))
-        views.append(features[moves[0], world.body.proprio_size : -23])
+    views = [seen_from(d, 0.3, (-0.05, 0.1)) for d in (Instruction.EAST, Instruction.NORTH, Instruction.WEST)]
     assert views[0] == pytest.approx(views[1], abs=1e-5)
     assert views[0] == pytest.approx(views[2], abs=1e-5)
+
+
+def test_the_mirrored_situation_has_the_mirrored_features():
+    one = seen_from(Instruction.EAST, 0.3, (-0.05, 0.1))
+    other = seen_from(Instruction.EAST, -0.3, (-0.05, -0.1))
+    mirror = feature_layout(BALL).mirror
+    size = len(one)
+    assert one != pytest.approx(other, abs=0.05)
+    assert one == pytest.approx(other[mirror.source[:size]] * mirror.sign[:size], abs=1e-5)
+    full = np.arange(feature_layout(BALL).size)
+    assert np.array_equal(mirror.source[mirror.source], full)
 
 
 def test_the_scripted_driver_solves_whole_levels():
@@ -122,15 +148,6 @@ def test_the_scripted_driver_solves_whole_levels():
     assert report["success_rate"] == 1.0
     assert report["lost"] == {}
     assert report["instructions"]["kinds"]["move"]["success_rate"] == 1.0
-
-
-def test_the_scripted_driver_pushes_fast_and_keeps_boxes_on_their_lanes():
-    # In level 4030 a box jams when the robot still bends to its lane while it touches the box.
-    instructions = judge(scripted_driver, OraclePlanner(), episodes=4, first_seed=4028, difficulty=5)["instructions"]
-    assert instructions["failures"] == {}
-    feasible = instructions["feasible"]
-    assert feasible["n"] == feasible["completed"] == sum(kind["n"] for kind in instructions["kinds"].values())
-    assert instructions["kinds"]["push"]["median_steps"] <= 36
 
 
 def test_random_instructions_judge_every_kind():

@@ -4,71 +4,108 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from mujoban_controller import load
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
-from mujoban_controller.goal_task import GoalTaskConfig
+from mujoban_controller.episodes import TrainingEpisodes
+from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.mpo import MPOTrainingConfig
-from mujoban_controller.train import NetworkConfig, Options, TrainConfig, TrainingRun, training_episodes
+from mujoban_controller.ppo import PPOTrainingConfig
+from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_controller.train import NetworkConfig, Options, TrainConfig, make_trainer
 from mujoban_core.grid import Instruction
-from mujoban_rl.run_directory import RunError
+from mujoban_rl.engine import Trainer
+from mujoban_rl.run_directory import RunDirectory, RunError
+from mujoban_rl.testing import check_refusal, check_resuming
+from mujoban_rl.weights import load_weights, save_weights
 from mujoban_sim.goals import GoalKind
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
 TASK = GoalTaskConfig(batch=4, difficulty=1)
 NETWORK = NetworkConfig(channels=(4, 8, 8), features=16, hidden=8)
-DISTIL = DistilConfig(length=8, sequences=2, replay=16, reuse=1.0)
-MPO = MPOTrainingConfig(length=8, sequences=2, replay=16, reuse=1.0, target_period=2)
+MPO = MPOTrainingConfig(window=6, windows=4, sequence=8, replay=64, first=32, reuse=1.0, target_period=2)
+DISTIL = DistilConfig(window=4, windows=2, sequence=4, replay=64, first=16, reuse=0.5)
+STAGES = {
+    "ppo": TrainConfig(stage="teacher", algorithm="ppo", task=TASK, ppo=PPOTrainingConfig(length=8, minibatch=16)),
+    "mpo": TrainConfig(stage="teacher", algorithm="mpo", task=TASK, mpo=MPO),
+    "asymmetric": TrainConfig(stage="mpo", task=TASK, network=NETWORK, asymmetric=MPO),
+    "distil": TrainConfig(stage="distil", teacher=Path("teacher"), task=TASK, network=NETWORK, distil=DISTIL),
+}
 
 
-def options(path: Path, stage: str, steps: int) -> Options:
-    config = TrainConfig(stage=stage, steps=steps, task=TASK, network=NETWORK, distil=DISTIL, mpo=MPO)
-    return Options(path, config, evaluation_episodes=0, save_every=0.0)
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory):
+    path = tmp_path_factory.mktemp("teacher") / "teacher.safetensors"
+    policy = PrivilegedPolicy("ball")
+    save_weights(path, policy, policy.config, {})
+    return path
 
 
-@pytest.mark.parametrize("stage", ["teacher", "distil", "mpo"])
-def test_a_run_stops_and_resumes_where_it_was(stage, tmp_path):
-    run = TrainingRun(options(tmp_path, stage, 96))
-    for _ in range(2):
-        run.learner.collect()
-        run.learner.learn()
-    run._save()
-    resumed = TrainingRun(options(tmp_path, stage, 96))
-    assert (resumed.learner.frames, resumed.learner.updates) == (64, run.learner.updates)
-    for name, module in run.learner.modules.items():
-        for key, value in module.state_dict().items():
-            assert torch.equal(value, resumed.learner.modules[name].state_dict()[key]), (name, key)
-    resumed.run()
-    assert resumed.learner.frames == 96
-    record = json.loads((tmp_path / f"{'teacher' if stage == 'teacher' else 'controller'}.json").read_text())
-    assert record["steps"] == 96
-    assert record["training"]["stage"] == stage
-    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
-    assert all(math.isfinite(v) for v in json.loads(lines[-1]).values() if v is not None)
+@pytest.fixture(params=STAGES)
+def make(request, teacher):
+    config = STAGES[request.param]
+    if config.teacher is not None:
+        config = replace(config, teacher=teacher)
+
+    def make_run(path: Path, steps: int = 512, **changes: Any) -> Trainer[Any]:
+        return make_trainer(Options(path, replace(config, steps=steps), **{"evaluation_episodes": 0, **changes}))
+
+    return make_run
 
 
-def test_the_product_of_a_run_loads_as_a_controller(tmp_path):
-    TrainingRun(options(tmp_path, "distil", 32)).run()
-    controller = load(tmp_path / "controller.safetensors")
-    assert controller.hidden == NETWORK.hidden
-    assert float(controller.proprio_scale.std()) > 0
+def test_a_batch_with_nan_leaves_all_that_a_stage_learns_untouched(make, tmp_path):
+    def poisoned(batch):
+        name = next(k for k in ("label", "reward") if (k in batch if isinstance(batch, dict) else hasattr(batch, k)))
+        if isinstance(batch, dict):
+            return {**batch, name: batch[name] * math.nan}
+        return batch._replace(reward=batch.reward * math.nan)
+
+    check_refusal(make(tmp_path), poisoned)
+
+
+def test_a_run_that_is_terminated_and_resumed_equals_one_that_never_stopped(make, tmp_path):
+    check_resuming(make, tmp_path, stop_at=3, updates=6)
+
+
+def test_the_product_of_a_run_has_a_record_and_loads(make, tmp_path):
+    trainer = make(tmp_path, 96)
+    assert trainer.run() and trainer.progress.samples >= 96
+    file = next(tmp_path.glob("*r.safetensors"))
+    record = json.loads(file.with_suffix(".json").read_text())
+    assert record["samples"] == trainer.progress.samples and record["training"]["seed"] == 0
+    product = load_weights(type(trainer.learner.product), file)
+    assert all(torch.equal(v, product.state_dict()[k]) for k, v in trainer.learner.product.state_dict().items())
+
+
+def test_the_best_product_on_validation_levels_is_exported(teacher, tmp_path):
+    learner = make_trainer(Options(tmp_path, replace(STAGES["ppo"], steps=64), evaluation_episodes=2)).learner
+    with torch.no_grad():
+        for parameter in learner.policy.parameters():
+            parameter.zero_()
+    first = learner.evaluate()
+    learner._best_score = (2.0, 2.0)
+    with torch.no_grad():
+        learner.policy.log_scale.fill_(-1.0)
+    assert learner.evaluate() == first
+    learner.export(RunDirectory(tmp_path, {**asdict(STAGES["ppo"]), "steps": 64}), {})
+    assert float(load_weights(PrivilegedPolicy, tmp_path / "teacher.safetensors").log_scale.detach().max()) == 0.0
 
 
 def test_a_run_directory_belongs_to_one_configuration(tmp_path):
-    TrainingRun(options(tmp_path, "distil", 32))
+    make_trainer(Options(tmp_path, STAGES["ppo"]))
     with pytest.raises(RunError, match="steps"):
-        TrainingRun(options(tmp_path, "distil", 64))
+        make_trainer(Options(tmp_path, replace(STAGES["ppo"], steps=64)))
 
 
 def test_training_levels_are_never_test_levels():
-    episodes = training_episodes(1, np.random.default_rng(0))
+    episodes = TrainingEpisodes(1, np.random.default_rng(0), max_nodes=10_000)
     assert all(episodes().seed in TRAIN_SEEDS for _ in range(5))
 
 
@@ -115,6 +152,8 @@ def test_torques_of_blocked_instructions_weigh_as_configured():
     assert action_loss(GoalKind.HOLD, Instruction.STAY) == pytest.approx(full)
 
 
-def test_a_teacher_without_distillation_is_refused():
+def test_stages_say_what_weights_they_need():
     with pytest.raises(ValueError, match="only the stage distil"):
         TrainConfig(stage="mpo", teacher=Path("teacher.safetensors"))
+    with pytest.raises(ValueError, match="expected --teacher"):
+        TrainConfig(stage="distil")

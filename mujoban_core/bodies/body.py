@@ -1,4 +1,4 @@
-"""The robot's bodies: actuators, proprioception, scale and MJCF of each (paper appendix B, A.3).
+"""What a robot's body is: actuators, proprioception, scale and MJCF (paper appendix B, A.3).
 
 The world never assumes a particular body: it reads what it needs from a `Body`. The robot's generalised
 coordinates follow those of the boxes (see `mujoban_sim.scene`). A body's root is either
@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.camera import CameraMount
-from mujoban_core.grid import TIME_LIMIT
 
 FIRST_PERSON_CAMERA: Final = "first_person"
 """Name of the camera that every body carries; it yields o_cam."""
@@ -34,11 +33,79 @@ UP_AXIS_SIZE: Final = 3
 
 
 @dataclass(frozen=True)
-class Actuator:
-    """A motor: normalised torque in [-1, 1] times `gear` [N m] on a joint."""
+class Motor:
+    """Takes a torque: its normalised control in [-1, 1] times `gear` [N m] acts on a joint."""
 
     joint: str
     gear: float
+
+    @property
+    def mjcf(self) -> str:
+        """The actuator's element."""
+        return (
+            f'<motor name="{self.joint}" joint="{self.joint}" gear="{self.gear}" ctrllimited="true" ctrlrange="-1 1"/>'
+        )
+
+
+@dataclass(frozen=True)
+class Servo:
+    """Takes an angle: its normalised control in [-1, 1] is the position of a joint around `centre` that it holds.
+
+    Attributes:
+        joint: the joint.
+        centre: position for control 0 [rad].
+        span: how far from it control 1 is [rad].
+        stiffness: torque for each radian that is left [N m / rad].
+        damping: torque against each radian per second [N m s / rad].
+        force: largest torque [N m].
+    """
+
+    joint: str
+    centre: float
+    span: float
+    stiffness: float
+    damping: float
+    force: float
+
+    @property
+    def mjcf(self) -> str:
+        """The actuator's element."""
+        return (
+            f'<general name="{self.joint}" joint="{self.joint}" ctrllimited="true" ctrlrange="-1 1" '
+            f'forcelimited="true" forcerange="{-self.force} {self.force}" biastype="affine" '
+            f'gainprm="{self.stiffness * self.span}" '
+            f'biasprm="{self.stiffness * self.centre} {-self.stiffness} {-self.damping}"/>'
+        )
+
+
+Actuator = Motor | Servo
+
+
+class Relabelling(NamedTuple):
+    """How a body's joints, or its actuators, look after it was turned or mirrored."""
+
+    source: tuple[int, ...]
+    """Entry i of the new order is entry `source[i]` of the body's own."""
+    sign: tuple[float, ...]
+    """Factor of each entry of the new order."""
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """Which postures of a body are the same for what it can do.
+
+    Attributes:
+        mirror: joints after a reflection at the robot's x-z plane.
+        quarter_turn: joints as seen when the robot's left side is put ahead; None for a body with a single front.
+    """
+
+    mirror: Relabelling
+    quarter_turn: tuple[int, ...] | None = None
+
+    @property
+    def sides(self) -> int:
+        """Number of sides that can be put ahead."""
+        return 1 if self.quarter_turn is None else 4
 
 
 @dataclass(frozen=True)
@@ -110,7 +177,10 @@ class Body:
         joints: names of the J proprioceptive joints (hinges), in the order of proprioception.
         joint_qpos: their offsets among the robot's positions.
         joint_qvel: their offsets among the robot's velocities.
-        actuators: motors in the order of the torque's U components.
+        joint_range: their lowest and highest positions [rad]; None for one that turns freely, whose position tells
+            nothing of the posture.
+        symmetry: what can be mirrored and turned.
+        actuators: motors or servos in the order of the torque's U components.
         rest_qpos: the robot's positions when it stands at the map's origin and heads east; it settles from there.
         cell_size: edge of a cell in metres; the world is scaled by it, box mass and peg size are not (A.3).
         time_limit: steps of an episode at 20 Hz (240 s for the ball, 480 s for the ant).
@@ -124,6 +194,8 @@ class Body:
     joints: tuple[str, ...]
     joint_qpos: tuple[int, ...]
     joint_qvel: tuple[int, ...]
+    joint_range: tuple[tuple[float, float] | None, ...]
+    symmetry: Symmetry
     actuators: tuple[Actuator, ...]
     rest_qpos: tuple[float, ...]
     cell_size: float
@@ -151,6 +223,20 @@ class Body:
         """Where the heading stands in proprioception; None for a free root, which does not feel it."""
         return self.proprio.joint_position.start + self.joint_qpos.index(3) if self.root == "slides" else None
 
+    @cached_property
+    def sides(self) -> tuple[tuple[int, ...], ...]:
+        """The order of joints in which each side that can be put ahead looks like the front, [S][J]."""
+        orders = [tuple(range(len(self.joints)))]
+        for _ in range(self.symmetry.sides - 1):
+            turn = self.symmetry.quarter_turn or orders[0]
+            orders.append(tuple(turn[i] for i in orders[-1]))
+        return tuple(orders)
+
+    def of_actuators(self, source: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the order of actuators that goes with an order of joints."""
+        joints = [self.joints.index(a.joint) for a in self.actuators]
+        return tuple(joints.index(source[j]) for j in joints)
+
     @property
     def qpos_size(self) -> int:
         """Number of the robot's positions."""
@@ -175,12 +261,8 @@ class Body:
 
     @cached_property
     def actuator_mjcf(self) -> str:
-        """The ``<actuator>`` section; controls are normalised torques in [-1, 1]."""
-        motors = "".join(
-            f'<motor name="{a.joint}" joint="{a.joint}" gear="{a.gear}" ctrllimited="true" ctrlrange="-1 1"/>'
-            for a in self.actuators
-        )
-        return f"<actuator>{motors}</actuator>"
+        """The ``<actuator>`` section; controls are in [-1, 1]."""
+        return f"<actuator>{''.join(a.mjcf for a in self.actuators)}</actuator>"
 
     @cached_property
     def sensor_mjcf(self) -> str:
@@ -188,63 +270,9 @@ class Body:
         return "<sensor>" + "".join(f'<{kind} site="imu"/>' for kind in _SENSORS) + "</sensor>"
 
 
-# Two degrees of freedom: a steered head rolls on a ball, after the BoxHead walker of dm_control without its
-# arms and kick. Gears and damping are measured choices: top speed 2 m/s without wheel spin. Low torsional
-# friction, since a high one leaves a dead band of steering. The camera looks 6 degrees down from 0.85 m, which
-# sees over boxes. Ears show the heading from above: red on the right, blue on the left.
-_BALL_HEIGHT: Final = 0.6
-_BALL_CAMERA: Final = CameraMount(forward=0.15, height=0.85, pitch=math.radians(6.0), fovy=80.0)
-_BALL_MJCF: Final = f"""
-<body name="{ROBOT_BODY}" pos="0 0 {_BALL_HEIGHT}">
-  <joint name="x" type="slide" axis="1 0 0"/>
-  <joint name="y" type="slide" axis="0 1 0"/>
-  <joint name="z" type="slide" axis="0 0 1"/>
-  <joint name="steer" type="hinge" axis="0 0 1" damping="4"/>
-  <inertial pos="0 0 -0.08" mass="{{head_mass}}" diaginertia="{{head_inertia}}"/>
-  <site name="imu" pos="0 0 0" size="0.01" group="4"/>
-  <geom name="head" class="robot_visual" type="cylinder" size="0.1 0.06" pos="0 0 -0.07" rgba="0.3 0.3 0.3 1"/>
-  <geom name="ear_red" class="robot_visual" type="sphere" size="0.1" pos="0 -0.2 0" rgba="0.7 0 0 1"/>
-  <geom name="ear_blue" class="robot_visual" type="sphere" size="0.1" pos="0 0.2 0" rgba="0 0 0.7 1"/>
-  {_BALL_CAMERA.mjcf(FIRST_PERSON_CAMERA, origin_height=_BALL_HEIGHT)}
-  <body name="wheel" pos="0 0 -0.4">
-    <joint name="roll" type="hinge" axis="0 1 0" damping="2"/>
-    <geom name="ball" class="robot" type="sphere" size="0.2" mass="1" condim="4" friction="{{friction}}"
-          rgba="0.6 0.6 0.6 1"/>
-  </body>
-</body>
-"""
-
 ROBOT_DEFAULTS: Final = """
-<default class="robot"><geom contype="7" conaffinity="7"/></default>
+<default class="robot"><geom contype="0" conaffinity="7"/></default>
 <default class="robot_visual"><geom contype="0" conaffinity="0" mass="0"/></default>
 """
-"""MJCF defaults that every body's fragment relies on; contact bits as in `mujoban_sim.scene`."""
-
-BALL: Final = Body(
-    name="ball",
-    root="slides",
-    joints=("roll", "steer"),
-    joint_qpos=(4, 3),
-    joint_qvel=(4, 3),
-    actuators=(Actuator("roll", 20.0), Actuator("steer", 20.0)),
-    rest_qpos=(0.0, 0.0, 0.0, 0.0, 0.0),
-    cell_size=1.0,
-    time_limit=TIME_LIMIT,
-    camera=_BALL_CAMERA,
-    mjcf=_BALL_MJCF,
-)
-
-BODIES: Final[dict[str, Body]] = {BALL.name: BALL}
-"""Registry of bodies; add one and every environment, node and trainer accepts its name."""
-
-
-def get_body(name: str) -> Body:
-    """Return the body of a given name.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    try:
-        return BODIES[name]
-    except KeyError:
-        raise ValueError(f"unknown body {name!r}: expected one of {', '.join(sorted(BODIES))}") from None
+"""MJCF defaults that every body's fragment relies on; contact bits as in `mujoban_sim.scene`. A robot touches all but
+itself."""

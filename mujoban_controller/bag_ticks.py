@@ -1,0 +1,202 @@
+"""Ticks for MPO of the camera policy from recorded bags of the running stack (see `mujoban_msgs_py.bags`).
+
+What the goal task would have said is worked out from the ground truth in the bag: goals, privileged features,
+rewards and discounts. The memory before a tick is that of the policy that learns, which is run over the episode
+for it.
+
+Shapes: L ticks of an episode, R rows, K boxes, N rows and columns of the grid, U actuators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mujoban_controller.controller import Recurrent, VisuomotorController
+from mujoban_controller.goal_features import feature_layout, privileged_features, side_ahead
+from mujoban_controller.goal_rewards import GoalReward
+from mujoban_controller.goal_settings import GoalTaskConfig
+from mujoban_controller.goal_task import LOOK_AGAIN
+from mujoban_controller.goal_view import StoredView
+from mujoban_controller.play import INPUT_FIELDS, MEMORY_FIELDS, Fields
+from mujoban_core.bodies import Body, get_body
+from mujoban_core.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMIT, WALL
+from mujoban_msgs_py import topics
+from mujoban_msgs_py.bags import Bag, BagError
+from mujoban_msgs_py.bags.training import episode_ticks, find_bags, open_training_bag
+from mujoban_sim.goals import GoalKind, GoalTracker
+from mujoban_sim.oracles import cells_of_boxes
+
+TOPICS: Final = (
+    topics.EPISODE,
+    topics.CAMERA,
+    topics.PROPRIO,
+    topics.INSTRUCTION,
+    topics.TERMINATION,
+    topics.TORQUE,
+    topics.TRUE_POSE,
+    topics.TRUE_TWIST,
+    topics.TRUE_BOXES,
+    topics.TRUE_ABSTRACT_STATE,
+    topics.TRUE_TERMINATION,
+)
+"""What training needs of a bag."""
+
+
+def episodes(bag: Bag) -> Iterator[list[tuple[Any, ...]]]:
+    """Yield the ticks of each episode, in the order of `TOPICS`, from its start up to a tick that is missing.
+
+    Raises:
+        BagError: As `episode_ticks`.
+    """
+    found: list[tuple[Any, ...]] = []
+    for reading, values in episode_ticks(bag, TOPICS):
+        if reading.step == 0 and found:
+            yield found
+            found = []
+        found.append(values)
+    if found:
+        yield found
+
+
+def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fields:
+    """Return the fields of MPO's replay for all but the last tick of an episode, [L - 1, ...].
+
+    Args:
+        ticks: As `episodes` yields them.
+        config: Rewards and body.
+
+    Raises:
+        BagError: If the bag is of another body.
+    """
+    body = get_body(config.body)
+    _, frame, proprio, instruction, said, torque, pose, velocity, box, state, true = zip(*ticks, strict=True)
+    if len(proprio[0]) != body.proprio_size or len(torque[0]) != body.action_size:
+        raise BagError(f"proprioception of {len(proprio[0])} values: expected a bag of the body {body.name}")
+    boxes, abstract = np.stack(box), np.stack(state)
+    cells = cells_of_boxes(boxes, body.cell_size)
+    agent = abstract[..., AGENT].reshape(len(ticks), -1).argmax(-1)
+    wall, completed = abstract[..., WALL] > 0.5, np.array([t.terminated for t in true])
+    # Bags do not hold the boxes' speed. It is that over the ticks before and after.
+    velocity_of_boxes = np.gradient(boxes, CONTROL_PERIOD, axis=0)
+    goals, elapsed = _goals(
+        instruction, completed, wall, np.stack([agent // GRID_SIZE, agent % GRID_SIZE], -1), cells, body
+    )
+    view = StoredView(
+        body, len(ticks), goals, np.stack(proprio), np.stack(pose), np.stack(velocity),
+        boxes, np.linalg.norm(velocity_of_boxes, axis=-1), cells, wall,
+    )  # fmt: skip
+    now = np.arange(len(ticks) - 1)
+    ended = np.array([t.terminated for t in said])[1:]
+    failed = ended & ~completed[1:] & np.array([t.timed_out for t in said])[1:]
+    terminated = np.array([t.terminated for t in said])
+    terminated[0] = False
+    applied = np.stack(torque).astype(np.float32)
+    before = np.concatenate([np.zeros_like(applied[:1]), applied[:-1]])
+    side = _sides(view, elapsed)
+    rule = GoalReward(config.reward)
+    there = rule.before(view.at(now, now))
+    change = (applied - before)[:-1]
+    order = feature_layout(body).actuators[side]
+    discount = (~failed).astype(np.float32)
+    # What comes after the last tick is another episode.
+    discount[-1] = 0.0
+    return {
+        "features": privileged_features(view, elapsed, before, side)[:-1],
+        "side": side[:-1],
+        "first": now == 0,
+        "frame": np.stack(frame)[:-1],
+        "proprio": view.proprio[:-1],
+        "instruction": np.array([i.direction for i in instruction], np.int64)[:-1],
+        "terminated": terminated[:-1],
+        "action": np.take_along_axis(applied, order, 1)[:-1],
+        "reward": rule.after(view.at(now + 1, now), there, change, ended & completed[1:], failed),
+        "discount": discount,
+    }
+
+
+def _sides(view: StoredView, elapsed: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the side ahead at each tick, as the goal task chooses it, [L]."""
+    side, ticks = side_ahead(view), np.rint(elapsed * INSTRUCTION_LIMIT).astype(np.int64)
+    again = (ticks % LOOK_AGAIN == 0) & ((ticks == 0) | (view.goals.kind != GoalKind.PUSH))
+    since = np.maximum.accumulate(np.where(again, np.arange(len(side)), 0))
+    return side[since]
+
+
+def _goals(
+    instruction: Sequence[Any],
+    completed: NDArray[np.bool_],
+    wall: NDArray[np.bool_],
+    agent: NDArray[np.int64],
+    boxes: NDArray[np.int64],
+    body: Body,
+) -> tuple[GoalTracker, NDArray[np.float64]]:
+    """Return the goals in force at each tick and the share of the time limit that they have had, [L]."""
+    tracker, row = GoalTracker(1, cell_size=body.cell_size), np.zeros(1, np.int64)
+    memories, elapsed, since = [], [], 0
+    for t, reading in enumerate(instruction):
+        if t == 0 or reading.sequence != instruction[t - 1].sequence:
+            tracker.reached[:] = completed[t] and t > 0
+            direction = np.array([reading.direction], np.int64)
+            tracker.begin(row, direction, wall[t : t + 1], agent[t : t + 1], boxes[t : t + 1])
+            since = t
+        memories.append(tracker.memory())
+        elapsed.append((t - since) / INSTRUCTION_LIMIT)
+    goals = GoalTracker(len(memories), cell_size=body.cell_size)
+    goals.restore([np.concatenate(values) for values in zip(*memories, strict=True)])
+    return goals, np.array(elapsed)
+
+
+class BagTicks(Iterator[Fields]):
+    """Endless ticks of R episodes at a time; each row takes bag after bag in an order that is drawn anew each time.
+
+    Where a run is resumed the rows begin anew.
+    """
+
+    def __init__(
+        self, paths: Sequence[Path], config: GoalTaskConfig, policy: VisuomotorController, rows: int,
+        rng: np.random.Generator,
+    ) -> None:  # fmt: skip
+        """Read `rows` rows from bags, or folders of bags; `policy` is the one that acts, whose weights change.
+
+        Raises:
+            BagError: If there is no bag at a path, or one lacks a topic.
+        """
+        self._config, self._policy, self._rng = config, policy, rng
+        self._bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
+        self._rows = [self._endless() for _ in range(rows)]
+
+    def __next__(self) -> Fields:
+        """Return one tick of every row with the policy's memory before it, [R, ...] each.
+
+        Raises:
+            BagError: As `episodes` and `transitions`, or if no episode has two ticks.
+        """
+        ticks = [next(row) for row in self._rows]
+        return {name: np.stack([tick[name] for tick in ticks]) for name in ticks[0]}
+
+    def _endless(self) -> Iterator[Fields]:
+        while True:
+            count = 0
+            for i in self._rng.permutation(len(self._bags)):
+                for ticks in episodes(self._bags[i]):
+                    if len(ticks) > 1:
+                        count += 1
+                        yield from self._play(transitions(ticks, self._config))
+            if not count:
+                raise BagError(f"no episode of 2 ticks in {len(self._bags)} bags")
+
+    @torch.no_grad()
+    def _play(self, fields: Fields) -> Iterator[Fields]:
+        """Yield an episode's ticks with the policy's memory before each."""
+        memory = Recurrent(*self._policy.initial_memory(1))
+        for t in range(len(fields["first"])):
+            before = {name: m[0].numpy().copy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
+            yield {k: v[t] for k, v in fields.items()} | before
+            seen = (torch.from_numpy(np.asarray(fields[k][t : t + 1]))[None] for k in INPUT_FIELDS)
+            memory = self._policy(*seen, memory=memory).memory

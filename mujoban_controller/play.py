@@ -1,0 +1,251 @@
+"""Players: what acts in the goal task while others learn from it, tick by tick into a replay.
+
+Shapes: B robots, R recorded rows, M windows of a batch, W ticks of a window, D features, U actuators.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mujoban_controller.controller import Recurrent, VisuomotorController
+from mujoban_controller.goal_task import GoalTask, TaskStep
+from mujoban_controller.judge import OutcomeSummary
+from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_core.interfaces import ControllerInput, Memory, renew_rows
+from mujoban_rl.engine import Scalars, Source, State
+from mujoban_rl.replay import SequenceBuilder, SequenceReplay
+
+Fields = dict[str, NDArray]
+Batch = dict[str, Tensor]
+MEMORY_FIELDS = ("memory0", "memory1", "memory2")
+"""A camera policy's memory before a tick, `Recurrent`."""
+INPUT_FIELDS = ("frame", "proprio", "instruction", "terminated")
+"""What a camera policy sees."""
+
+
+def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
+    """Return the memory with which a camera policy went into windows, [M, ...]."""
+    return Recurrent(*(batch[name][:, 0] for name in MEMORY_FIELDS))
+
+
+class Player(ABC):
+    """Acts in the goal task with a policy of its own, whose weights `take` renews."""
+
+    task: GoalTask
+
+    @abstractmethod
+    def tick(self) -> tuple[Fields, TaskStep]:
+        """Play one tick; return what is to be kept of it, [B, ...] each, and what happened."""
+
+    @abstractmethod
+    def take(self, weights: Mapping[str, Tensor]) -> None:
+        """Act with these weights from now on."""
+
+    def state(self) -> State:
+        """Return all that changes but the weights."""
+        return State.of({"task": self.task.state()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self.task.restore(state.part("task"))
+
+
+class PrivilegedPlayer(Player):
+    """A privileged policy that explores."""
+
+    def __init__(self, task: GoalTask, policy: PrivilegedPolicy, generator: torch.Generator) -> None:
+        """Play with a copy of `policy` and noise from `generator`."""
+        self.task, self._generator = task, generator
+        self._policy = PrivilegedPolicy(**policy.config)  # pyright: ignore[reportArgumentType]
+        self._features: NDArray[np.float32] = task.features()
+
+    @torch.no_grad()
+    def tick(self) -> tuple[Fields, TaskStep]:
+        """Play one tick."""
+        features = self._features
+        action = self._policy(torch.from_numpy(features)).sample(self._generator).clamp(-1.0, 1.0).numpy()
+        result = self.task.step(self.task.torque_of(action))
+        self._features = self.task.features()
+        kept = {"features": features, "action": action, "reward": result.reward, "discount": result.discount}
+        return kept, result
+
+    def take(self, weights: Mapping[str, Tensor]) -> None:
+        """Act with these weights from now on."""
+        self._policy.load_state_dict(dict(weights))
+
+    def state(self) -> State:
+        """Return all that changes but the weights."""
+        own = State(tensors={"generator": self._generator.get_state()})
+        return State.of({"task": self.task.state(), "noise": own})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        super().restore(state)
+        self._generator.set_state(state.part("noise").tensors["generator"])
+        self._features = self.task.features()
+
+
+class CameraPlayer(Player):
+    """A camera policy with its memory; what it makes of its distribution over torques is up to subclasses."""
+
+    def __init__(self, task: GoalTask, policy: VisuomotorController, generator: torch.Generator) -> None:
+        """Play with a copy of `policy` and randomness from `generator`."""
+        self.task, self.generator = task, generator
+        self._policy = VisuomotorController(**policy.config)  # pyright: ignore[reportArgumentType]
+        self._policy.mixed_precision = policy.mixed_precision
+        self._memory: Memory = self._policy.initial_memory(task.world.batch)
+
+    @property
+    def policy(self) -> VisuomotorController:
+        """The copy that acts."""
+        return self._policy
+
+    @torch.no_grad()
+    def tick(self) -> tuple[Fields, TaskStep]:
+        """Play one tick."""
+        task, first = self.task, self.task.first.copy()
+        memory = renew_rows(self._memory, self._policy.initial_memory(len(first)), first)
+        inputs = task.observe()
+        output = self._policy(*self._policy.to_tensors(inputs), memory=Recurrent(*memory))
+        self._memory = output.memory
+        kept: Fields = {name: getattr(inputs, name) for name in INPUT_FIELDS}
+        kept |= {name: m.numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
+        torque, extra = self._act(inputs, output.action.mean[:, 0], output.action.scale[:, 0])
+        result = task.step(torque)
+        return {**kept, "first": first, **extra, "reward": result.reward, "discount": result.discount}, result
+
+    @abstractmethod
+    def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
+        """Return the torques to apply, [B, U], and what else is to be kept of the tick."""
+
+    def take(self, weights: Mapping[str, Tensor]) -> None:
+        """Act with these weights from now on."""
+        self._policy.load_state_dict(dict(weights))
+
+    def state(self) -> State:
+        """Return all that changes but the weights."""
+        memory = {name: m for name, m in zip(MEMORY_FIELDS, self._memory, strict=True)}
+        own = State(tensors={"generator": self.generator.get_state(), **memory})
+        return State.of({"task": self.task.state(), "policy": own})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        super().restore(state)
+        tensors = state.part("policy").tensors
+        self.generator.set_state(tensors["generator"])
+        self._memory = Recurrent(*(tensors[name] for name in MEMORY_FIELDS))
+
+
+class ExploringPlayer(CameraPlayer):
+    """A camera policy that draws its torques, for MPO with an asymmetric critic."""
+
+    def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
+        task = self.task
+        noise = torch.randn(mean.shape, generator=self.generator)
+        torque = (mean + scale * noise).clamp(-1.0, 1.0).numpy()
+        return torque, {"features": task.features(), "side": task.side.copy(), "action": task.action_of(torque)}
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What is drawn from a replay, and how often."""
+
+    capacity: int
+    """Sequences in the replay."""
+    length: int
+    """Ticks of a sequence."""
+    window: int
+    """W."""
+    windows: int
+    """M."""
+    per_tick: float
+    """Batches for each tick played."""
+    first: int
+    """Ticks played before the first batch."""
+
+    @property
+    def overlap(self) -> int:
+        """Ticks that a sequence shares with the one before: windows shorter than it begin at every tick alike."""
+        return self.window - 1 if self.window < self.length else 0
+
+
+class ReplaySource(Source[Batch]):
+    """Windows of W successive ticks, drawn evenly from what a player has played last, and from recordings beside it."""
+
+    def __init__(
+        self, player: Player, draw: Draw, generator: torch.Generator, recorded: Iterator[Fields] | None = None
+    ) -> None:
+        """Play and draw.
+
+        Args:
+            player: Adds B rows to each tick.
+            draw: How batches are drawn.
+            generator: Draws windows.
+            recorded: Ticks of recordings that are kept beside those of the player, [R, ...] each.
+        """
+        self._player, self._draw, self._generator, self._recorded = player, draw, generator, recorded
+        self._replay = SequenceReplay(draw.capacity, draw.length)
+        self._builder = SequenceBuilder(draw.length, draw.overlap)
+        self._due, self._ticks = 0.0, 0
+        self._summary = OutcomeSummary()
+
+    @property
+    def player(self) -> Player:
+        """Who plays."""
+        return self._player
+
+    def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
+        """Let the player act with these weights."""
+        self._player.take(weights)
+
+    def next_batch(self) -> Batch:
+        """Play until a batch is due; return windows, [M, W, ...] each."""
+        while self._due < 1.0 or not self._replay.added:
+            self._play()
+        self._due -= 1.0
+        return self._replay.sample(self._draw.windows, self._generator, self._draw.window)
+
+    def _play(self) -> None:
+        tick, result = self._player.tick()
+        self._summary.add(result.outcomes)
+        self.samples += len(result.reward)
+        if self._recorded is not None:
+            beside = next(self._recorded)
+            tick = {name: np.concatenate([values, beside[name]]) for name, values in tick.items()}
+        sequence = self._builder.add(tick)
+        if sequence is not None:
+            self._replay.add(sequence)
+        self._ticks += 1
+        if self._ticks >= self._draw.first:
+            self._due += self._draw.per_tick
+
+    def statistics(self) -> Scalars:
+        """Return how instructions went since the last call."""
+        summary, self._summary = self._summary, OutcomeSummary()
+        return summary.scalars()
+
+    def state(self) -> State:
+        """Return the replay, the player's state and what draws from them."""
+        own = State({"due": self._due, "ticks": self._ticks}, {"generator": self._generator.get_state()})
+        parts = {"player": self._player.state(), "replay": self._replay.state(), "builder": self._builder.state()}
+        return State.of({**parts, "own": own})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._player.restore(state.part("player"))
+        self._replay.restore(state.part("replay"))
+        self._builder.restore(state.part("builder"))
+        own = state.part("own")
+        self._due, self._ticks = own.values["due"], own.values["ticks"]
+        self._generator.set_state(own.tensors["generator"])
+
+    def close(self) -> None:
+        """Free the cameras."""
+        self._player.task.world.close()

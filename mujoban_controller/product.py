@@ -1,0 +1,108 @@
+"""What the learners of all stages have in common: a product that is judged on whole levels, and the best one kept."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from torch import Tensor
+
+from mujoban_controller.controller import VisuomotorController
+from mujoban_controller.drivers import Driver, PrivilegedDriver
+from mujoban_controller.judge import judge
+from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_core.interfaces import Controller
+from mujoban_rl.engine import Learner, Scalars, State
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.weights import save_weights
+from mujoban_sim.oracles import OraclePlanner
+from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sokoban.generator import VALIDATION_SEEDS
+
+BatchT = TypeVar("BatchT")
+Product = VisuomotorController | PrivilegedPolicy
+
+
+@dataclass(frozen=True)
+class Validation:
+    """On which levels products are compared; 0 episodes: on none, and the newest is the best."""
+
+    episodes: int = 0
+    body: str = "ball"
+    difficulty: int = 5
+    world: str = DEFAULT_WORLD
+    threads: int = 1
+
+
+class ProductLearner(Learner[BatchT]):
+    """A learner whose product is a controller or a teacher.
+
+    Late checkpoints differ by more than training improves them, so what is exported is the product that has solved
+    the most validation levels.
+    """
+
+    def __init__(self, validation: Validation) -> None:
+        """Compare products by `validation`."""
+        self._validation = validation
+        self._best_score: tuple[float, float] | None = None
+        self._best_weights: dict[str, Tensor] = {}
+
+    @property
+    @abstractmethod
+    def product(self) -> Product:
+        """The network that the run is for, as it is now."""
+
+    @abstractmethod
+    def own_state(self) -> State:
+        """Return what changes beside modules, optimisers and the best product."""
+
+    @abstractmethod
+    def restore_own(self, state: State) -> None:
+        """Take over what `own_state` returned."""
+
+    def state(self) -> State:
+        """Return what changes beside modules and optimisers."""
+        score = None if self._best_score is None else list(self._best_score)
+        return State.of({"own": self.own_state(), "best": State({"score": score}, self._best_weights)})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self.restore_own(state.part("own"))
+        best = state.part("best")
+        self._best_weights = best.tensors
+        self._best_score = None if best.values["score"] is None else tuple(best.values["score"])
+
+    def evaluate(self) -> Scalars:
+        """Return how many validation levels the product solves under a solver's plans; keep it if it is the best."""
+        where, product = self._validation, self.product
+        if not where.episodes:
+            return {}
+        training = product.training
+        product.eval()
+        driver: Driver | Controller = PrivilegedDriver(product) if isinstance(product, PrivilegedPolicy) else product
+        report = judge(
+            driver, OraclePlanner(), episodes=where.episodes, first_seed=VALIDATION_SEEDS.start, body=where.body,
+            difficulty=where.difficulty, world=where.world, batch=128, threads=where.threads,
+        )  # fmt: skip
+        product.train(training)
+        feasible = report["instructions"]["feasible"]
+        score = (report["success_rate"], feasible["completed"] / max(feasible["n"], 1))
+        if self._best_score is None or score >= self._best_score:
+            self._best_score = score
+            self._best_weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
+        kinds = report["instructions"]["kinds"]
+        medians = {f"steps/{k}": v["median_steps"] for k, v in kinds.items() if v["median_steps"] is not None}
+        return {"solved": score[0], "feasible": score[1], "steps": report["median_steps"], **medians}
+
+    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
+        """Write the best product, or the present one where none was judged."""
+        product = self.product
+        name = "teacher" if isinstance(product, PrivilegedPolicy) else "controller"
+        chosen = type(product)(**product.config)  # pyright: ignore[reportArgumentType]
+        chosen.load_state_dict(self._best_weights or product.state_dict())
+        score = self._best_score
+        best = None if score is None else {"solved": score[0], "feasible": score[1]}
+        path = directory.path / f"{name}.safetensors"
+        save_weights(path, chosen, product.config, {**record, "validation": best})

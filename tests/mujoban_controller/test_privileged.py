@@ -1,0 +1,91 @@
+"""Privileged policies: what symmetric bodies see, and the policy as a controller of the stack."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from mujoban_controller.drivers import PrivilegedDriver
+from mujoban_controller.episodes import SeededEpisodes
+from mujoban_controller.goal_features import feature_layout
+from mujoban_controller.goal_settings import judging_config
+from mujoban_controller.goal_task import GoalTask
+from mujoban_controller.privileged import Normaliser, PrivilegedPolicy
+from mujoban_controller.privileged_controller import PrivilegedController
+from mujoban_core.bodies import ANT, BALL, BODIES
+from mujoban_core.interfaces import renew_rows
+from mujoban_sim.goals import GoalKind
+from mujoban_sim.oracles import OraclePlanner
+
+
+def wild_policy(body):
+    """Return a policy whose actions depend on what it sees from the first tick on."""
+    torch.manual_seed(0)
+    policy = PrivilegedPolicy(body)
+    with torch.no_grad():
+        policy.layers[-1].weight.mul_(60.0)
+    return policy
+
+
+def make(body, batch=3):
+    config = judging_config(batch, body, 2, world="reference")
+    return GoalTask(config, OraclePlanner(), SeededEpisodes(2, 10_000_000), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", sorted(BODIES))
+def test_as_a_controller_it_does_what_it_does_in_the_goal_task(name):
+    task, policy = make(name), wild_policy(name)
+    controller = PrivilegedController(policy)
+    driver, memory = PrivilegedDriver(policy), controller.initial_memory(3)
+    rows, before = np.arange(3), task.world.box_position.copy()
+    for _ in range(130):
+        memory = renew_rows(memory, controller.initial_memory(3), task.first)
+        torque, memory = controller.step(task.observe(camera=False), memory)
+        expected = driver(task)
+        # A box's speed follows from where it was a tick ago, so it is not exact while one moves.
+        moved = np.abs(task.world.box_position - before).max(-1)[rows, task.world.goals.box_index] > 1e-5
+        moved |= task.world.box_speed[rows, task.world.goals.box_index] > 1e-3
+        still = ~((task.world.goals.kind == GoalKind.PUSH) & moved)
+        before = task.world.box_position.copy()
+        np.testing.assert_allclose(torque[still], expected[still], atol=1e-4)
+        task.step(torque)
+
+
+@pytest.mark.parametrize("body", [ANT, BALL], ids=lambda b: b.name)
+def test_mirroring_twice_and_turning_four_times_change_nothing(body):
+    layout = feature_layout(body)
+    for mirror in (layout.mirror, layout.mirror_action):
+        assert np.array_equal(mirror.source[mirror.source], np.arange(len(mirror.source)))
+        assert (mirror.sign * mirror.sign[mirror.source] == 1.0).all()
+    assert len(layout.joints) == body.symmetry.sides
+    order = np.arange(len(body.joints))
+    for _ in range(4):
+        order = order[layout.joints[-1]] if body.symmetry.sides > 1 else order
+    assert np.array_equal(order, np.arange(len(body.joints)))
+
+
+def test_an_ant_that_is_turned_by_a_quarter_puts_another_side_ahead_and_sees_the_same():
+    task = make("ant", 1)
+    world = task.world
+    seen, sides = [], []
+    for quarter in range(4):
+        pose = world.pose.astype(float)
+        pose[:, 2] = 0.2 + quarter * np.pi / 2
+        world.place([0], pose, world.box_position)
+        task._turn_sides(np.array([0]))
+        seen.append(task.features()[0])
+        sides.append(int(task.side[0]))
+    assert sorted(sides) == [0, 1, 2, 3]
+    for other in seen[1:]:
+        np.testing.assert_allclose(other, seen[0], atol=0.02)
+    action = np.arange(8, dtype=np.float32)[None]
+    assert np.array_equal(task.action_of(task.torque_of(action)), action)
+
+
+def test_features_are_normalised_by_all_samples_seen():
+    normaliser, x = Normaliser(3), torch.randn(500, 3) * 4.0 + 2.0
+    for part in x.split(77):
+        normaliser.update(part)
+    assert torch.allclose(normaliser.mean, x.mean(0), atol=1e-4)
+    assert torch.allclose(normaliser(x).std(0), torch.ones(3), atol=0.05)
