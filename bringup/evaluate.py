@@ -1,6 +1,7 @@
 """Evaluate the stack on many levels in one vectorised rollout: `python bringup/evaluate.py`.
 
-With `--graph` the same episodes run through the ROS graph, one after the other.
+With `--graph` the same episodes run through the ROS graph, one after the other; with `--cluster` they are shared out
+over the machines of a Ray cluster.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from bringup.cluster import EveryNth, add_cluster_options, evaluate_on_cluster
 from bringup.command import (
     Parser,
     add_episode_options,
@@ -62,7 +64,7 @@ class SolvedBar(Progress):
 
 def evaluate(
     policy: SensePlanAct,
-    episodes: Episodes,
+    episodes: Episodes | EveryNth,
     *,
     world: str = DEFAULT_WORLD,
     batch: int = 64,
@@ -104,9 +106,12 @@ def main(command_line: Sequence[str] | None = None) -> int:
     add_episode_options(parser, episodes=256, seed=VALIDATION_SEEDS.start)
     add_module_options(parser)
     parser.add_argument("--batch", type=positive, default=64, help="episodes that run at the same time")
+    add_cluster_options(parser)
     parser.add_argument("--graph", action="store_true", help="play through the ROS graph instead")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there instead of printing it")
     arguments = parser.parse_args(command_line)
+    if arguments.graph and arguments.cluster:
+        parser.error("--graph --cluster: expected one of the two, since the graph plays on this machine")
     import_from_here()
     episodes, stack = episodes_from(arguments), stack_from(arguments)
     from mujoban_rl.weights import provenance
@@ -123,6 +128,13 @@ def main(command_line: Sequence[str] | None = None) -> int:
         content = report(
             outcome.results, stack.identities(), world=arguments.world, ticks_per_second=outcome.ticks_per_second
         )
+    elif arguments.cluster:
+        with SolvedBar(len(episodes)) as bar:
+            results = evaluate_on_cluster(
+                stack, episodes, arguments.cluster, num_actors=arguments.num_actors, world=arguments.world,
+                batch=arguments.batch, time_limit=arguments.time_limit, on_results=bar.show,
+            )  # fmt: skip
+        content = report(results, stack.identities(), world=arguments.world)
     else:
         results = evaluate(
             stack.policy(),

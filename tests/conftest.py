@@ -1,6 +1,8 @@
 """What all tests share: a private ROS domain on this host, checked message fields, one software-rendering thread."""
 
 import os
+import sys
+from pathlib import Path
 
 # Before anything imports ROS or MuJoCo.
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
@@ -11,6 +13,10 @@ os.environ.setdefault("LP_NUM_THREADS", "0")
 
 import pytest
 
+IMPORTABLE = str(Path(__file__).parent / "importable")
+"""Where worker processes import from what tests let them do."""
+sys.path.append(IMPORTABLE)
+
 
 @pytest.fixture
 def ros():
@@ -20,3 +26,16 @@ def ros():
     rclpy.init()
     yield rclpy
     rclpy.try_shutdown()
+
+
+@pytest.fixture(scope="session")
+def ray_cluster():
+    """Run tests on a Ray cluster of this machine with room for two actors."""
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'mujoban[cluster]'")
+    from mujoban_rl.actors.cluster import Cluster
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([IMPORTABLE, os.environ.get("PYTHONPATH", "")]))
+        cluster = Cluster(cpus=2)
+        yield cluster
+        cluster.close()

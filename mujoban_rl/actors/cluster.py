@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,8 @@ import torch
 from mujoban_rl.actors.actor import ActorError, ActorFactory, Arrays, Experience, Order, Seat
 from mujoban_rl.actors.pool import ActorDied, ActorPool, Schedule
 
+_ANSWER_SECONDS: Final = 5.0
+"""Time that a cluster has to answer; Ray itself asks on for minutes."""
 _STORE_BYTES: Final = 512 * 2**20
 """Size of the object store of a cluster that runs on this machine alone: what lies in it is a few sequences."""
 
@@ -60,15 +63,33 @@ class Cluster:
         self._ours = not ray.is_initialized()
         if not self._ours:
             return
-        own = {"num_cpus": max(1, round(cpus)), "object_store_memory": _STORE_BYTES, "include_dashboard": False}
+        _check(address)
+        own = {
+            "num_cpus": max(1, round(cpus)),
+            "object_store_memory": _STORE_BYTES,
+            "include_dashboard": False,
+            # Ray's workers yield to everything else that a machine does, and starve where it does much.
+            "_system_config": {"worker_niceness": 0},
+        }
         with _same_signals():
-            ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **({} if address else own))
+            ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **({} if address else own))
 
     def close(self) -> None:
         """Leave the cluster, and end it if this has started it."""
         if self._ours:
             with _same_signals():
                 self.ray.shutdown()
+
+
+def _check(address: str | None) -> None:
+    """Raise `ConnectionError` if there is nobody at an address of the form HOST:PORT."""
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if not colon or not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), _ANSWER_SECONDS).close()
+    except OSError as error:
+        raise ConnectionError(f"no Ray cluster at {address}: {error}") from None
 
 
 @contextmanager

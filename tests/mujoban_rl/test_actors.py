@@ -11,7 +11,9 @@ from typing import Annotated
 import numpy as np
 import pytest
 import torch
+import toy_actors
 import tyro
+from toy_actors import ROWS, TICKS, Centre, LastFew, Walkers
 
 from mujoban_rl.actors import ActorError, ActorOptions, ActorSource
 from mujoban_rl.actors.local import LocalPool, ThreadPool
@@ -19,9 +21,6 @@ from mujoban_rl.actors.pool import ActorDied
 from mujoban_rl.actors.processes import ProcessPool
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory
-
-sys.path.append(str(Path(__file__).parent))
-from toys import ROWS, TICKS, Centre, LastFew, Walkers
 
 STEPS = TICKS * ROWS
 
@@ -142,8 +141,9 @@ def test_an_error_of_an_actor_ends_the_run_with_its_message():
 def test_processes_end_with_a_learner_that_is_killed(tmp_path):
     script = tmp_path / "learner.py"
     script.write_text(
-        f"import sys; sys.path.append({str(Path(__file__).parent)!r})\n"
-        "import time\nimport torch\nfrom mujoban_rl.actors.processes import ProcessPool\nfrom toys import Walkers\n"
+        f"import sys; sys.path.append({str(Path(toy_actors.__file__).parent)!r})\n"
+        "import time\nimport torch\nfrom toy_actors import Walkers\n"
+        "from mujoban_rl.actors.processes import ProcessPool\n"
         "if __name__ == '__main__':\n"
         "    pool = ProcessPool(Walkers(), 1)\n"
         "    pool.publish({'weight': torch.zeros(1)}, 0)\n"

@@ -3,40 +3,23 @@
 import math
 import os
 import signal
-import sys
-from pathlib import Path
 
 import pytest
 import torch
-
-pytest.importorskip("ray", reason="Ray is not installed: pip install 'mujoban[cluster]'")
+from toy_actors import Centre, LastFew, Walkers
 
 from mujoban_rl.actors import ActorError, ActorSource
-from mujoban_rl.actors.cluster import Cluster, RayPool
+from mujoban_rl.actors.cluster import RayPool
 from mujoban_rl.actors.local import LocalPool
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory
 
-sys.path.append(str(Path(__file__).parent))
-from toys import Centre, LastFew, Walkers
+
+def test_a_cluster_leaves_signals_to_those_who_handled_them(ray_cluster):
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-@pytest.fixture(scope="module")
-def cluster():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
-        yield from connected()
-
-
-def connected():
-    handler = signal.getsignal(signal.SIGTERM)
-    started = Cluster(cpus=2)
-    assert signal.getsignal(signal.SIGTERM) is handler
-    yield started
-    started.close()
-
-
-def test_training_goes_on_when_an_actor_is_killed_and_equals_local_training_until_then(tmp_path, cluster):
+def test_training_goes_on_when_an_actor_is_killed_and_equals_local_training_until_then(tmp_path, ray_cluster):
     runs = {}
     for name, pool in (("local", LocalPool(Walkers(), 2, "ordered")), ("ray", RayPool(Walkers(), 2, "ordered"))):
         source = ActorSource(pool, LastFew(), steps_per_update=4.0)
@@ -59,7 +42,7 @@ def test_training_goes_on_when_an_actor_is_killed_and_equals_local_training_unti
     assert run.progress.samples == 40 * 4 and run.source.worker_cpu_seconds() > 0.0
 
 
-def test_an_error_of_an_actor_on_the_cluster_ends_the_run_with_its_message(cluster):
+def test_an_error_of_an_actor_on_the_cluster_ends_the_run_with_its_message(ray_cluster):
     pool = RayPool(Walkers(fails_in=(0,)), 1)
     pool.publish({"weight": torch.zeros(1)}, 0)
     with pytest.raises(ActorError, match="ArithmeticError: stream 0 is broken"):
