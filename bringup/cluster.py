@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 
 from bringup.command import Stack, positive
 from bringup.results import EpisodeResult
-from mujoban_rl.actors.cluster import Cluster
+from mujoban_core.threads import set_threads
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.episodes import Episodes, EpisodeSpec, LazyEpisodes
 
@@ -36,16 +36,18 @@ def spread(
     jobs: Sequence[JobT],
     address: str = HERE,
     *,
+    cpus: float = 1.0,
     gpus: float = 0.0,
     on_result: Callable[[int, ResultT], None] = lambda index, result: None,
 ) -> list[ResultT]:
-    """Do jobs on a Ray cluster, one CPU each, and return their results in the order of the jobs.
+    """Do jobs on a Ray cluster and return their results in the order of the jobs.
 
     Args:
         function: Does a job; must be of a module that all machines have, and do no harm when it is done again after
             it was cut off, since a job whose machine is lost is done by another.
         jobs: Plain dataclasses.
         address: See `mujoban_rl.actors.cluster.Cluster`; or `HERE`.
+        cpus: CPUs for each job.
         gpus: GPUs for each job.
         on_result: Called with the index of a job and its result as soon as it is done.
 
@@ -54,10 +56,12 @@ def spread(
         ConnectionError: If there is no cluster at the address.
         Exception: What `function` raised.
     """
-    cluster = Cluster(None if address == HERE else address, cpus=len(jobs))
+    from mujoban_rl.actors.cluster import Cluster
+
+    cluster = Cluster(None if address == HERE else address, cpus=cpus * len(jobs))
     try:
         ray: Any = cluster.ray
-        task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=_RETRIES)(function)
+        task = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=_RETRIES)(function)
         waiting = {task.remote(job): index for index, job in enumerate(jobs)}
         results: dict[int, ResultT] = {}
         while waiting:
@@ -132,15 +136,15 @@ def evaluate_on_cluster(
         on_results(ended)
 
     gpus = float(stack.device.startswith("cuda"))
-    done = spread(_play, shares, address, gpus=gpus, on_result=on_result)
+    done = spread(_play, shares, address, cpus=stack.threads, gpus=gpus, on_result=on_result)
     return [done[i % n][i // n] for i in range(len(episodes))]
 
 
 def _play(share: _Share) -> list[EpisodeResult]:
-    import torch
-
     from bringup.evaluate import evaluate
 
-    torch.set_num_threads(1)
-    policy = share.stack.policy()
-    return evaluate(policy, share.episodes, world=share.world, batch=share.batch, time_limit=share.time_limit)
+    set_threads(share.stack.threads)
+    return evaluate(
+        share.stack.policy(), share.episodes, world=share.world, batch=share.batch, time_limit=share.time_limit,
+        threads=share.stack.threads,
+    )  # fmt: skip

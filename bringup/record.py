@@ -1,13 +1,15 @@
 """Record many episodes as bags, quickly: `python bringup/record.py --out DIR`.
 
 The policy is the learned stack or, in part, its oracles (`--oracle`), and is disturbed so that the recording covers
-more than the states that it would visit; `--undisturbed` leaves it alone. Several processes share the work.
+more than the states that it would visit; `--undisturbed` leaves it alone. Several processes share the work, here or
+(`--cluster`) on the machines of a Ray cluster, which must all see the folder.
 """
 
 from __future__ import annotations
 
 import argparse
 import multiprocessing
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from bringup.cluster import add_cluster_options, spread
 from bringup.command import (
     Parser,
     Stack,
@@ -151,6 +154,13 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
     return recorder.ticks
 
 
+def record_again(job: Job) -> int:
+    """Record a job that may have been cut off before, by the loss of a machine; return the number of ticks."""
+    for left in job.out.glob(f"{job.prefix}*"):
+        shutil.rmtree(left)
+    return record(job)
+
+
 class _Answer(NamedTuple):
     """What a recording process has to say."""
 
@@ -239,13 +249,25 @@ def main(command_line: Sequence[str] | None = None) -> int:
     if arguments.processes < 1 or arguments.batch < 1:
         raise ValueError(f"{arguments.processes} processes, batch {arguments.batch}: expected at least 1")
     arguments.seed = recorded_seed(arguments.seed, records=True, allow_test_seeds=arguments.allow_test_seeds)
+    if arguments.cluster:
+        arguments.processes = arguments.num_actors
     jobs = [_job(arguments, part) for part in range(min(arguments.processes, arguments.episodes))]
     arguments.out.mkdir(parents=True, exist_ok=True)
-    with working(jobs) as answers, Progress(console=Console(stderr=True)) as progress:
+    with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task("recorded", total=arguments.episodes)
-        total = gather(answers, lambda ended: progress.update(task, advance=ended))
+        total = _record_all(jobs, arguments.cluster, lambda ended: progress.update(task, advance=ended))
     print(f"{total} ticks of {arguments.episodes} episodes in {len(list(arguments.out.iterdir()))} bags")
     return 0
+
+
+def _record_all(jobs: Sequence[Job], cluster: str | None, on_end: Callable[[int], None]) -> int:
+    """Record all jobs, on a cluster if there is one; return the number of ticks."""
+    if cluster is None:
+        with working(jobs) as answers:
+            return gather(answers, on_end)
+    cpus = jobs[0].stack.threads
+    done = spread(record_again, jobs, cluster, cpus=cpus, on_result=lambda i, ticks: on_end(len(jobs[i].episodes)))
+    return sum(done)
 
 
 def _arguments(command_line: Sequence[str] | None) -> argparse.Namespace:
@@ -262,6 +284,7 @@ def _arguments(command_line: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--time-limit", type=int, default=600, help="ticks of an episode; 0: those of the body")
     parser.add_argument("--batch", type=int, default=32, help="episodes at the same time in each process")
     parser.add_argument("--processes", type=int, default=2, help="processes that share the work")
+    add_cluster_options(parser)
     parser.add_argument("--undisturbed", action="store_true", help="let the policy do as it will")
     add_world_option(parser)
     add_module_options(parser)
