@@ -9,7 +9,7 @@ import os
 import platform
 import sys
 
-DEFAULT = ("world", "rendering", "graph", "levels")
+DEFAULT = ("world", "rendering", "graph", "levels", "actors")
 """Benchmarks of speed; each has a `run` that returns a mapping."""
 
 
