@@ -90,8 +90,8 @@ def initial_visits(batch: int) -> VisitMemory:
     )
 
 
-class PushThoughts(NamedTuple):
-    """What was thought of the pushes since the boxes stand as they do: means over the views of the board so far.
+class PushMeans(NamedTuple):
+    """Running means of the verdicts on pushes since the boxes stand as they do: test-time augmentation, view by view.
 
     Which push is best does not depend on where the robot is on its way to it, so that every decision of the walk can
     look at the board from another side.
@@ -107,21 +107,21 @@ class PushThoughts(NamedTuple):
     """log(1 - p(dead)) of each push, [M, D, I, I]."""
 
 
-def initial_thoughts(batch: int) -> PushThoughts:
-    """Return the thoughts of `batch` episodes before the first."""
+def initial_means(batch: int) -> PushMeans:
+    """Return the means of `batch` episodes before the first view."""
     shape = (batch, len(_STEPS), INTERIOR, INTERIOR)
     nothing = np.zeros(shape, np.float32)
-    return PushThoughts(np.zeros(batch, np.int64), np.zeros(batch, np.int64), nothing, nothing.copy())
+    return PushMeans(np.zeros(batch, np.int64), np.zeros(batch, np.int64), nothing, nothing.copy())
 
 
-def recall(abstract_state: NDArray[np.float32], thoughts: PushThoughts) -> PushThoughts:
-    """Return what still holds of `thoughts` in these states, [M, N, N, 4]: nothing where the boxes have moved."""
+def recall(abstract_state: NDArray[np.float32], means: PushMeans) -> PushMeans:
+    """Return what still holds of `means` in these states, [M, N, N, 4]: nothing where the boxes have moved."""
     boxes = _box_keys(abstract_state)
-    return thoughts._replace(boxes=boxes, views=np.where(boxes == thoughts.boxes, thoughts.views, 0))
+    return means._replace(boxes=boxes, views=np.where(boxes == means.boxes, means.views, 0))
 
 
-def ponder(views: int, seen: Tensor, before: Tensor, now: Tensor) -> Tensor:
-    """Return the mean of a thought, [M, D, I, I], over `seen` views, [M], before and so many further `views` now.
+def running_mean(views: int, seen: Tensor, before: Tensor, now: Tensor) -> Tensor:
+    """Return the mean of a plane, [M, D, I, I], over `seen` views, [M], before and so many further `views` now.
 
     Once every symmetric view was taken, the latest weigh more.
     """
@@ -129,10 +129,10 @@ def ponder(views: int, seen: Tensor, before: Tensor, now: Tensor) -> Tensor:
     return before + share[:, None, None, None] * (now - before)
 
 
-def hesitate(
+def abstain(
     abstract_state: NDArray[np.float32],
     decision: NDArray[np.int64],
-    thoughts: PushThoughts,
+    means: PushMeans,
     counts: VisitCounts,
     *,
     doubt: float,
@@ -146,17 +146,17 @@ def hesitate(
     Args:
         abstract_state: [M, N, N, 4].
         decision: The decisions so far, [M].
-        thoughts: What was thought of the pushes, these decisions included.
-        counts: What was tried before. Where estimates flicker, thoughts end with the boxes that they were about, so
+        means: Of the pushes, these decisions included.
+        counts: What was tried before. Where estimates flicker, means end with the boxes that they were about, so
             that the decisions to stay in a cell are bounded as well.
         doubt: Probability that a push is deadly from which on another look is worth its time.
         perspectives: Views after which there is nothing new to see.
     """
-    again = (thoughts.views < perspectives) & (counts.since_arrival[:, _STAY] < perspectives)
+    again = (means.views < perspectives) & (counts.since_arrival[:, _STAY] < perspectives)
     rows = np.flatnonzero(again & (decision != _STAY))
     direction, states = decision[rows] - 1, abstract_state[rows]
     ahead = (likeliest_cells(states) + _STEPS[direction]) % _CELLS
-    p_alive = np.exp(thoughts.push_alive.reshape(-1, len(_STEPS), INTERIOR**2)[rows, direction, _INTERIOR_CELL[ahead]])
+    p_alive = np.exp(means.push_alive.reshape(-1, len(_STEPS), INTERIOR**2)[rows, direction, _INTERIOR_CELL[ahead]])
     pushes = states.reshape(-1, _CELLS, len(CHANNELS))[np.arange(len(rows)), ahead, BOX] > 0.5
     decision = decision.copy()
     decision[rows[pushes & (p_alive < 1.0 - doubt)]] = _STAY

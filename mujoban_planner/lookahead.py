@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mujoban_core.interfaces import Memory, Planner, put_rows, take_rows
 from mujoban_planner.abstract_env import MOVE_LIMIT, AbstractEnvironment
 from mujoban_planner.boards import likeliest_boards, state_tensor
-from mujoban_planner.decision import PushThoughts, VisitCounts, count_visits, recall, remember, state_keys
+from mujoban_planner.decision import PushMeans, VisitCounts, count_visits, recall, remember, state_keys
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state, split_memory
 from mujoban_planner.search import search
 
@@ -49,7 +49,7 @@ class LookAheadPlanner(Planner):
         """Return an instruction for each state, [M] from [M, N, N, 4], and the next memory; errors as the planner's."""
         check_abstract_state(abstract_state)
         plan, cursor, expected, wait = (np.array(x) for x in memory[:4])
-        visits, thoughts = split_memory(memory[4:])
+        visits, means = split_memory(memory[4:])
         key = state_keys(abstract_state)
         lost = (key != expected) | (plan[np.arange(len(plan)), cursor] == 0)
         wait = np.maximum(wait - 1, 0)
@@ -64,15 +64,15 @@ class LookAheadPlanner(Planner):
         decision = planned.copy()
         if alone.any():
             rows = np.flatnonzero(alone)
-            before = recall(abstract_state[rows], PushThoughts(*take_rows(thoughts, rows)))
+            before = recall(abstract_state[rows], PushMeans(*take_rows(means, rows)))
             chosen, after = self.planner.choose(abstract_state[rows], VisitCounts(*take_rows(counts, rows)), before)
-            thoughts = put_rows(thoughts, rows, after)
+            means = put_rows(means, rows, after)
             decision[alone] = chosen
             plan[alone] = 0
         visits = remember(abstract_state, decision, visits)
         cursor = np.where(alone, 0, cursor + 1)
         expected = np.where(alone, _NO_KEY, _next_keys(abstract_state, decision))
-        return decision, (plan, cursor, expected, wait, *visits, *thoughts)
+        return decision, (plan, cursor, expected, wait, *visits, *means)
 
     def _search(
         self, states: NDArray[np.float32], rows: NDArray[np.int64], plan: NDArray[np.int64], wait: NDArray[np.int64]

@@ -21,17 +21,17 @@ from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.interfaces import Memory, Planner
 from mujoban_planner.compiled import CompiledDecision
 from mujoban_planner.decision import (
-    PushThoughts,
+    PushMeans,
     VisitCounts,
     VisitMemory,
+    abstain,
     count_visits,
-    hesitate,
-    initial_thoughts,
+    initial_means,
     initial_visits,
-    ponder,
     push_penalty,
     recall,
     remember,
+    running_mean,
     visit_penalty,
 )
 from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, Weighed, log_alive, verdicts
@@ -48,9 +48,9 @@ class LearnedPlanner(nn.Module, Planner):
 
     The decision is greedy over log pi(A | s) + caution * log(1 - p(dead | s, A)), one forward pass, less a penalty for
     what was already tried (`decision.visit_penalty`, `decision.push_penalty`), so that it neither repeats for ever a
-    move that does nothing nor runs in circles. What it thought of the pushes is averaged over the decisions in which
-    the boxes stand as they do (`decision.PushThoughts`), and before a push that may be deadly it stands still until it
-    has looked from every side (`decision.hesitate`). The rule is deterministic; what it remembers is its explicit
+    move that does nothing nor runs in circles. What it says of the pushes is averaged over the decisions in which
+    the boxes stand as they do (`decision.PushMeans`), and before a push that may be deadly it stands still until it
+    has looked from every side (`decision.abstain`). The rule is deterministic; what it remembers is its explicit
     memory.
     """
 
@@ -131,8 +131,8 @@ class LearnedPlanner(nn.Module, Planner):
                 module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]  # not in the stubs
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return an empty record of visits and thoughts for `batch` episodes: `VisitMemory` and `PushThoughts`."""
-        return (*initial_visits(batch), *initial_thoughts(batch))
+        """Return an empty record of visits and means for `batch` episodes: `VisitMemory` and `PushMeans`."""
+        return (*initial_visits(batch), *initial_means(batch))
 
     def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
         """Return an instruction for each state, [M] from [M, N, N, 4], and the next memory.
@@ -141,36 +141,36 @@ class LearnedPlanner(nn.Module, Planner):
             ValueError: If the states have another shape or hold values that are not finite.
         """
         check_abstract_state(abstract_state)
-        visits, thoughts = split_memory(memory)
-        decision, thoughts = self.choose(
-            abstract_state, count_visits(abstract_state, visits), recall(abstract_state, thoughts)
+        visits, means = split_memory(memory)
+        decision, means = self.choose(
+            abstract_state, count_visits(abstract_state, visits), recall(abstract_state, means)
         )
-        return decision, (*remember(abstract_state, decision, visits), *thoughts)
+        return decision, (*remember(abstract_state, decision, visits), *means)
 
     def choose(
-        self, abstract_state: NDArray[np.float32], counts: VisitCounts, thoughts: PushThoughts
-    ) -> tuple[NDArray[np.int64], PushThoughts]:
-        """Return the instruction of the highest score, or STAY to look again first, [M], and thoughts; see `scores`."""
-        scores, thoughts = self.scores(abstract_state, counts, thoughts)
+        self, abstract_state: NDArray[np.float32], counts: VisitCounts, means: PushMeans
+    ) -> tuple[NDArray[np.int64], PushMeans]:
+        """Return the instruction of the highest score, or STAY to look again first, [M], and means; see `scores`."""
+        scores, means = self.scores(abstract_state, counts, means)
         best = np.argmax(scores, axis=1)
-        decision = hesitate(
-            abstract_state, best, thoughts, counts, doubt=self.doubt, perspectives=self.perspectives
+        decision = abstain(
+            abstract_state, best, means, counts, doubt=self.doubt, perspectives=self.perspectives
         )
-        return decision, thoughts
+        return decision, means
 
     @torch.inference_mode()
     def scores(
-        self, abstract_state: NDArray[np.float32], counts: VisitCounts, thoughts: PushThoughts
-    ) -> tuple[NDArray[np.float64], PushThoughts]:
-        """Return log pi(A | s) + caution * log(1 - p(dead | s, A)), less what was tried before, [M, A], and thoughts.
+        self, abstract_state: NDArray[np.float32], counts: VisitCounts, means: PushMeans
+    ) -> tuple[NDArray[np.float64], PushMeans]:
+        """Return log pi(A | s) + caution * log(1 - p(dead | s, A)), less what was tried before, [M, A], and means.
 
         Args:
             abstract_state: [M, N, N, 4].
             counts: What was tried before.
-            thoughts: What was thought before with the boxes where they are.
+            means: Of earlier decisions with the boxes where they are.
         """
         penalty = push_penalty(counts)[..., 1:-1, 1:-1]
-        inputs = (abstract_state, thoughts.views, thoughts.push, thoughts.push_alive, penalty, np.array(self.caution))
+        inputs = (abstract_state, means.views, means.push, means.push_alive, penalty, np.array(self.caution))
         inputs = [np.ascontiguousarray(x, np.int64 if x.dtype.kind == "i" else np.float32) for x in inputs]
         if self.compiled is not None and len(abstract_state) == self.thinking == 1:
             score, push, push_alive = self.compiled(inputs)
@@ -178,13 +178,13 @@ class LearnedPlanner(nn.Module, Planner):
             device = next(self.parameters()).device
             weighed = self.weigh(*(torch.from_numpy(x).to(device) for x in inputs))
             score, push, push_alive = (x.cpu().numpy() for x in weighed)
-        thoughts = PushThoughts(thoughts.boxes, thoughts.views + self.views, push, push_alive)
-        return score.astype(np.float64) - visit_penalty(counts), thoughts
+        means = PushMeans(means.boxes, means.views + self.views, push, push_alive)
+        return score.astype(np.float64) - visit_penalty(counts), means
 
     def weigh(
         self, states: Tensor, seen: Tensor, push: Tensor, push_alive: Tensor, penalty: Tensor, caution: Tensor
     ) -> Weighed:
-        """Return the scores of the instructions, but for what was tried, and thoughts: one forward pass.
+        """Return the scores of the instructions, but for what was tried, and means: one forward pass.
 
         It is what `mujoban_planner.export` exports, hence tensors alone.
 
@@ -197,8 +197,8 @@ class LearnedPlanner(nn.Module, Planner):
             caution: Weight of the verdicts, [].
         """
         advice = self.advise(states, seen)
-        push = ponder(self.views, seen, push, advice.push)
-        push_alive = ponder(self.views, seen, push_alive, advice.push_alive)
+        push = running_mean(self.views, seen, push, advice.push)
+        push_alive = running_mean(self.views, seen, push_alive, advice.push_alive)
         wanted = push + caution * push_alive - penalty
         policy = advice.policy + self.heads.guide(wanted, input_planes(states))
         return Weighed(functional.log_softmax(policy, 1) + caution * advice.alive, push, push_alive)
@@ -225,10 +225,10 @@ class LearnedPlanner(nn.Module, Planner):
         return Advice(output.policy, log_alive(output.dead), output.push, verdicts(output))
 
 
-def split_memory(memory: Memory) -> tuple[VisitMemory, PushThoughts]:
+def split_memory(memory: Memory) -> tuple[VisitMemory, PushMeans]:
     """Return the two parts of a learned planner's memory."""
     visits = len(VisitMemory._fields)
-    return VisitMemory(*memory[:visits]), PushThoughts(*memory[visits:])
+    return VisitMemory(*memory[:visits]), PushMeans(*memory[visits:])
 
 
 def check_abstract_state(abstract_state: NDArray[np.float32]) -> None:

@@ -16,7 +16,7 @@ from torch.nn import functional
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.push_env import possible_masks
-from mujoban_planner.reinforcement import mute_verdicts
+from mujoban_planner.reinforcement import silence_verdicts
 from mujoban_planner.symmetry import push_images
 from mujoban_sokoban.bitboard import SIDE
 
@@ -65,7 +65,7 @@ class PushPolicy(nn.Module):
             for layer in (self.pushes, last):
                 layer.weight.zero_()
             if untaught:
-                mute_verdicts(planner)
+                silence_verdicts(planner)
                 planner.heads.policy.weight.zero_()
                 assert planner.heads.policy.bias is not None
                 planner.heads.policy.bias.zero_()

@@ -142,7 +142,7 @@ class MPOLearner(Learner[MPOBatch]):
         torch.manual_seed(config.seed)  # the initial weights
         self.network = (init or config.build()).to(self.device).train()
         if init is None:
-            mute_verdicts(self.network)
+            silence_verdicts(self.network)
         else:
             reset_stay_logit(self.network)
         self.target = copy.deepcopy(self.network).eval()
@@ -251,7 +251,7 @@ def reinforcement(
 
 
 @torch.no_grad()
-def mute_verdicts(network: LearnedPlanner) -> None:
+def silence_verdicts(network: LearnedPlanner) -> None:
     """Let a network that will never be taught what is deadly call nothing so; a decision weighs these verdicts."""
     heads = network.heads
     verdicts = [heads.dead] if heads.push_dead is None else [heads.dead, heads.push_dead[-1]]

@@ -10,7 +10,7 @@ import torch
 import mujoban_planner
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.compiled import graph_path
-from mujoban_planner.decision import count_visits, initial_thoughts, initial_visits
+from mujoban_planner.decision import count_visits, initial_means, initial_visits
 from mujoban_planner.export import export, main
 from mujoban_planner.networks import RecurrentPlanner
 from mujoban_planner.play import play
@@ -37,7 +37,7 @@ def small(exported, tmp_path):
 
 
 def _scores(planner, states):
-    return planner.scores(states, count_visits(states, initial_visits(1)), initial_thoughts(1))[0]
+    return planner.scores(states, count_visits(states, initial_visits(1)), initial_means(1))[0]
 
 
 def test_shipped_planner_decides_in_its_graph_as_in_pytorch():

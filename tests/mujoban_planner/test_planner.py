@@ -6,7 +6,7 @@ import mujoban_planner
 from mujoban_core.grid import GRID_SIZE, Instruction
 from mujoban_core.interfaces import take_rows
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.decision import HISTORY, count_visits, initial_thoughts, initial_visits, recall, remember
+from mujoban_planner.decision import HISTORY, count_visits, initial_means, initial_visits, recall, remember
 from mujoban_planner.heads import Advice, PlannerHeads
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
 from mujoban_planner.planner import LearnedPlanner, input_planes
@@ -229,7 +229,7 @@ def test_robot_walks_to_another_push_when_one_was_tried():
     def eagerness(tried: Instruction) -> float:
         pushes = np.zeros((1, 4, GRID_SIZE, GRID_SIZE), np.float32)
         pushes[:, tried - 1] = 5
-        scores, _ = planner.scores(states, untried._replace(pushes=pushes), initial_thoughts(1))
+        scores, _ = planner.scores(states, untried._replace(pushes=pushes), initial_means(1))
         return scores[0, Instruction.EAST] - scores[0, Instruction.WEST]
 
     assert eagerness(Instruction.WEST) > eagerness(Instruction.EAST) + 2.0
@@ -251,22 +251,22 @@ def test_thinking_time_averages_symmetric_views():
     planner.thinking = 8
     turned = view_states(torch.from_numpy(states), torch.full((2, 1), 3)).numpy()
     untried = count_visits(states, initial_visits(2))
-    upright, seen = (planner.scores(s, untried, initial_thoughts(2))[0] for s in (states, turned))
+    upright, seen = (planner.scores(s, untried, initial_means(2))[0] for s in (states, turned))
     assert np.allclose(upright, seen[:, instruction_map(3)], atol=1e-4)
     planner.thinking = 1
-    assert not np.allclose(upright, planner.scores(states, untried, initial_thoughts(2))[0], atol=1e-4)
+    assert not np.allclose(upright, planner.scores(states, untried, initial_means(2))[0], atol=1e-4)
 
 
 def test_decisions_look_at_the_boxes_from_another_side_each_time():
     planner, states = ResidualPlanner(16, 2).eval(), _states(2)
     untried = count_visits(states, initial_visits(2))
-    thoughts = initial_thoughts(2)
+    means = initial_means(2)
     for _ in range(SYMMETRIES):
-        thoughts = recall(states, thoughts)
-        _, thoughts = planner.scores(states, untried, thoughts)
+        means = recall(states, means)
+        _, means = planner.scores(states, untried, means)
     planner.thinking = SYMMETRIES
-    _, at_once = planner.scores(states, untried, recall(states, initial_thoughts(2)))
-    assert all(np.allclose(a, b, atol=1e-5) for a, b in zip(thoughts, at_once, strict=True))
+    _, at_once = planner.scores(states, untried, recall(states, initial_means(2)))
+    assert all(np.allclose(a, b, atol=1e-5) for a, b in zip(means, at_once, strict=True))
     assert NetworkConfig().build().thinking == 1
 
 
@@ -321,10 +321,10 @@ def test_planner_does_not_hesitate_for_ever_where_estimates_flicker():
     assert decisions == [Instruction.STAY] * SYMMETRIES + [Instruction.NORTH] * 4
 
 
-def test_thoughts_end_where_the_boxes_move():
+def test_means_end_where_the_boxes_move():
     states = _states(2)
-    thoughts = recall(states, initial_thoughts(2))._replace(views=np.array([5, 5]))
-    assert recall(states, thoughts).views.tolist() == [5, 5]
+    means = recall(states, initial_means(2))._replace(views=np.array([5, 5]))
+    assert recall(states, means).views.tolist() == [5, 5]
     moved = states.copy()
     moved[1, ..., 3] = np.roll(states[1, ..., 3], 1, axis=0)
-    assert recall(moved, thoughts).views.tolist() == [5, 0]
+    assert recall(moved, means).views.tolist() == [5, 0]

@@ -17,7 +17,7 @@ from mujoban_msgs_py.bags.training import EpisodeTick
 from mujoban_msgs_py.conversions import InstructionReading
 from mujoban_planner import bag_transitions, train
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.decision import count_visits, initial_thoughts, initial_visits
+from mujoban_planner.decision import count_visits, initial_means, initial_visits
 from mujoban_planner.growth import start_from
 from mujoban_planner.imitation import ImitationConfig, imitation, imitation_loss
 from mujoban_planner.lessons import LessonMaker
@@ -159,7 +159,7 @@ def test_a_planner_by_mpo_alone_is_not_led_by_verdicts_that_nobody_taught_it(pro
     scores = []
     for caution in (0.0, 4.0):
         planner.caution = caution
-        scores.append(planner.scores(states, count_visits(states, initial_visits(16)), initial_thoughts(16))[0])
+        scores.append(planner.scores(states, count_visits(states, initial_visits(16)), initial_means(16))[0])
     assert np.allclose(*scores, atol=1e-5)
 
 
