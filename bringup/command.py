@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.children import end_with_parent
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
@@ -121,6 +122,9 @@ class Stack:
     threads: int = 1
     """Threads of the networks in each process."""
 
+    body: str = BALL.name
+    """The robot's body; learned modules have to be of it."""
+
     @property
     def look_around_ticks(self) -> int:
         """Ticks of looking around at the start of an episode."""
@@ -132,17 +136,29 @@ class Stack:
         """Return the modules composed into one policy.
 
         Raises:
-            ValueError: If a module cannot be loaded, or `look_around` is negative.
+            ValueError: If a module cannot be loaded or is of another body, or `look_around` is negative.
         """
         from mujoban_core.sense_plan_act import SensePlanAct
 
         modules = {role: choice.load(self.device) for role, choice in self.choices.items()}
+        for role, module in modules.items():
+            check_body(role, module, self.body)
         ticks = self.look_around_ticks
         return SensePlanAct(**{role: look_around(module, ticks) for role, module in modules.items()})  # pyright: ignore
 
     def identities(self) -> dict[str, str]:
         """Return what identifies each module in a report."""
         return {role: choice.identity() for role, choice in self.choices.items()}
+
+
+def check_body(role: str, module: Module, body: str) -> None:
+    """Raise a `ValueError` if a learned module was trained for another body than the one that is played."""
+    config = getattr(module, "config", {})
+    trained = config.get("body") if isinstance(config, dict) else getattr(config, "body", None)
+    if trained not in (None, body):
+        raise ValueError(
+            f"the {role} was trained for the body {trained}: expected weights for {body}, or --oracle {role}"
+        )
 
 
 def positive(text: str) -> int:
@@ -166,7 +182,8 @@ def add_episode_options(parser: argparse.ArgumentParser, *, episodes: int | None
 
 
 def add_world_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option that chooses the physical world."""
+    """Add the options that choose the physical world and the robot's body."""
+    parser.add_argument("--body", choices=sorted(BODIES), default=BALL.name, help="the robot's body")
     parser.add_argument("--world", choices=WORLDS, default=DEFAULT_WORLD, help="physical world, see docs/world.md")
 
 
@@ -247,8 +264,17 @@ def stack_from(arguments: argparse.Namespace) -> Stack:
     for role in filter(None, arguments.oracle.split(",")):
         if role not in ROLES:
             raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
-        choices[role] = Choice(role, ORACLE)
-    return Stack(choices, arguments.device, arguments.look_around, arguments.threads)
+        choices[role] = _oracle(role, arguments.body)
+    return Stack(choices, arguments.device, arguments.look_around, arguments.threads, arguments.body)
+
+
+def _oracle(role: str, body: str) -> Choice:
+    """Return what knows the truth in a role; the script that drives the ball can drive no other body."""
+    if role == "controller" and body != BALL.name:
+        from mujoban_controller import teacher_weights
+
+        return Choice(role, LEARNED, teacher_weights(body))
+    return Choice(role, ORACLE)
 
 
 def import_from_here(path: Sequence[str] = ("",)) -> None:

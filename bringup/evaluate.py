@@ -26,6 +26,7 @@ from bringup.command import (
 )
 from bringup.results import EpisodeResult, report, use_of_test_levels, write_report
 from bringup.rollout import rollout
+from mujoban_core.bodies import BALL
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.threads import set_threads
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -66,6 +67,7 @@ def evaluate(
     policy: SensePlanAct,
     episodes: Episodes | EveryNth,
     *,
+    body: str = BALL.name,
     world: str = DEFAULT_WORLD,
     batch: int = 64,
     time_limit: int | None = None,
@@ -77,6 +79,7 @@ def evaluate(
     Args:
         policy: The four modules.
         episodes: Levels and seeds.
+        body: The robot's body.
         world: The physical world, see `mujoban_sim.presets`.
         batch: Rows of the world.
         time_limit: Steps of an episode; None means that of the body.
@@ -85,6 +88,7 @@ def evaluate(
     """
     robots = World(
         min(batch, len(episodes)),
+        body=body,
         world=world,
         max_boxes=episodes.max_boxes,
         time_limit=time_limit,
@@ -126,7 +130,11 @@ def main(command_line: Sequence[str] | None = None) -> int:
                 stack, episodes, options, on_refresh=lambda _, results: bar.show(results), refresh_period=1.0
             )
         content = report(
-            outcome.results, stack.identities(), world=arguments.world, ticks_per_second=outcome.ticks_per_second
+            outcome.results,
+            stack.identities(),
+            body=arguments.body,
+            world=arguments.world,
+            ticks_per_second=outcome.ticks_per_second,
         )
     elif arguments.cluster:
         with SolvedBar(len(episodes)) as bar:
@@ -139,13 +147,14 @@ def main(command_line: Sequence[str] | None = None) -> int:
         results = evaluate(
             stack.policy(),
             episodes,
+            body=arguments.body,
             world=arguments.world,
             batch=arguments.batch,
             time_limit=arguments.time_limit,
             threads=arguments.threads,
             progress=True,
         )
-        content = report(results, stack.identities(), world=arguments.world)
+        content = report(results, stack.identities(), body=arguments.body, world=arguments.world)
     if arguments.levels is None and seed_range(arguments.seed, len(episodes)) == "test":
         content["test_uses"] = [use_of_test_levels(content, provenance()["commit"])]
     if arguments.json is None:

@@ -47,6 +47,7 @@ def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Para
     """
     parameters = read_parameters()
     parameters["simulator"] |= {
+        "body": stack.body,
         "seed": episodes.seed,
         "episodes": len(episodes),
         "level_file": "" if episodes.level_file is None else str(episodes.level_file),

@@ -37,6 +37,7 @@ from bringup.command import (
 from bringup.exploration import Disturbance, disturbed
 from bringup.rollout import ticks
 from mujoban_core import children
+from mujoban_core.bodies import BALL
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.signals import StopSignal, interrupt_status, interruptible, leave
@@ -135,7 +136,9 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
     policy: SensePlanAct = job.stack.policy()
     if job.disturbance is not None:
         policy = disturbed(policy, job.disturbance, np.random.default_rng(job.seed))
-    world = World(min(job.batch, len(job.episodes)), world=job.world, time_limit=job.time_limit)
+    world = World(
+        min(job.batch, len(job.episodes)), body=job.stack.body, world=job.world, time_limit=job.time_limit
+    )
     difficulties = [job.episodes.difficulty(i) for i in range(len(job.episodes))]
     recorder = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix)
     try:
@@ -293,6 +296,8 @@ def _arguments(command_line: Sequence[str] | None) -> argparse.Namespace:
 
 def _job(arguments: argparse.Namespace, part: int) -> Job:
     """Return what process number `part` records: every `processes`-th episode."""
+    if arguments.body != BALL.name and not arguments.undisturbed:
+        raise ValueError(f"--body {arguments.body}: disturbances roll and steer a ball; expected --undisturbed")
     processes = min(arguments.processes, arguments.episodes)
     episodes = MixedEpisodes(
         len(range(part, arguments.episodes, processes)), arguments.seed + part, arguments.difficulty,

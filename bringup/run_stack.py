@@ -88,6 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     content = report(
         outcome.results,
         weights,
+        body=options.body,
         world=options.world,
         ticks_per_second=outcome.ticks_per_second,
         counts=dict(outcome.counts),

@@ -15,7 +15,7 @@ import rclpy
 from rclpy.executors import Executor
 from rclpy.parameter import Parameter
 
-from bringup.command import Stack
+from bringup.command import Stack, check_body
 from bringup.domain import claim_domain
 from bringup.graph import NODES, RESPAWN_PERIOD, GraphError, InProcess, Processes
 from bringup.graph_recorder import RecorderNode
@@ -25,6 +25,7 @@ from bringup.results import EpisodeResult
 from bringup.video import EDGE, VideoNode
 from mujoban_core import children
 from mujoban_core.camera import FRAME_SIZE
+from mujoban_core.plugins import ROLES
 from mujoban_core.signals import StopSignal
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
@@ -109,6 +110,8 @@ def play(
         init_ros()
         exits.callback(rclpy.try_shutdown)
         graph = exits.enter_context(InProcess(parameters, () if options.processes else NODES))
+        for role in () if options.processes else ROLES:
+            check_body(role, graph.nodes[role].module, stack.body)  # pyright: ignore[reportAttributeAccessIssue]
         monitor = graph.add(MonitorNode(len(episodes)))
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:

@@ -5,8 +5,6 @@ Shapes: B robots, U actuators.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,7 +16,6 @@ from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_core.bodies import get_body
 from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_LIMIT, WALL
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
-from mujoban_rl.weights import load_weights
 from mujoban_sim.goals import GoalKind, GoalTracker
 from mujoban_sim.oracles import cells_of_boxes, follow_goals
 
@@ -34,6 +31,7 @@ class PrivilegedController(Controller):
     def __init__(self, policy: PrivilegedPolicy) -> None:
         """Act by `policy`, on the body that it was trained for."""
         self._policy = policy.eval()
+        self.config = policy.config
         self._body = get_body(str(policy.config["body"]))
         self._layout = feature_layout(self._body)
 
@@ -72,11 +70,3 @@ class PrivilegedController(Controller):
         np.put_along_axis(torque, self._layout.actuators[side], action, 1)
         return torque, (*goals.memory(), elapsed + 1, side, torque, box.astype(np.float32))
 
-
-def load(path: str | Path, device: str = "cpu") -> PrivilegedController:
-    """Return the privileged controller with the given weights.
-
-    Raises:
-        mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit.
-    """
-    return PrivilegedController(load_weights(PrivilegedPolicy, path, device))

@@ -3,7 +3,8 @@
 Termination has to say whether the robot is within a tenth of a cell of a cell's centre, without being told its pose.
 Velocity and heading are felt, so how far the robot has come since its episode began at a cell's centre can be summed
 up; the camera corrects the drift. Everything is turned so that the instruction points along +x, since
-what completes an instruction does not depend on the compass.
+what completes an instruction does not depend on the compass. A body that does not feel its heading sums up its turns
+as well; its axes are then those in which its episode began, and how they lie in the map is for the camera to tell.
 
 Shapes: B robots, T ticks, P proprioceptive values.
 """
@@ -43,27 +44,23 @@ class Track(NamedTuple):
     """Unit vector of the instruction in force, [B, 2]; zero for `stay`."""
     before: Tensor
     """That of the instruction before it, [B, 2]."""
+    heading: Tensor
+    """Felt, or turned since the start of the episode, [B] radians."""
 
 
 class Odometry:
     """Turns proprioception into features of progress; has no weights."""
 
     def __init__(self, body: Body) -> None:
-        """Read a body's layout of proprioception.
-
-        Raises:
-            ValueError: if the body does not feel its heading.
-        """
-        if body.heading_index is None:
-            raise ValueError(f"body {body.name} has a free root: expected one with a joint that tells its heading")
+        """Read a body's layout of proprioception."""
         self.heading = body.heading_index
         self.part = body.proprio
         self.cell_size = body.cell_size
 
     def initial(self, batch: int, device: torch.device | str = "cpu") -> Track:
         """Return the track of robots at the centre of a cell at the start of an episode."""
-        zeros = torch.zeros(batch, 2, device=device)
-        return Track(zeros, zeros, zeros, zeros, torch.zeros(batch, device=device), zeros, zeros)
+        zeros, none = torch.zeros(batch, 2, device=device), torch.zeros(batch, device=device)
+        return Track(zeros, zeros, zeros, zeros, none, zeros, zeros, none)
 
     def __call__(
         self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Track
@@ -76,7 +73,7 @@ class Odometry:
             terminated: beta_{t-1}, bool [B, T]; A_{t-1} was issued in the tick before where true.
             track: before the first tick.
         """
-        psi = proprio[..., self.heading]
+        psi = self._headings(proprio, track)
         cos, sin = psi.cos(), psi.sin()
         ahead, left = (proprio[..., self.part.planar_velocity] / self.cell_size).unbind(-1)
         velocity = torch.stack([ahead * cos - left * sin, ahead * sin + left * cos], dim=-1)  # [B, T, 2]
@@ -84,14 +81,21 @@ class Odometry:
         direction = offsets[instruction]
         rows = []
         for t in range(proprio.shape[1]):
-            track = _advance(track, velocity[:, t], direction[:, t], terminated[:, t])
+            track = _advance(track, velocity[:, t], direction[:, t], terminated[:, t])._replace(heading=psi[:, t])
             rows.append(track)
         tracks = Track(*(torch.stack(parts, dim=1) for parts in zip(*rows, strict=True)))
         return self._features(proprio, velocity, direction, tracks), track
 
+    def _headings(self, proprio: Tensor, track: Track) -> Tensor:
+        """Return the heading of each tick, [B, T]."""
+        if self.heading is not None:
+            return proprio[..., self.heading]
+        turned = CONTROL_PERIOD * proprio[..., self.part.yaw_rate].squeeze(-1)
+        return track.heading[:, None] + turned.cumsum(1)
+
     def _features(self, proprio: Tensor, velocity: Tensor, direction: Tensor, track: Track) -> Tensor:
         stay = (direction == 0).all(dim=-1, keepdim=True)
-        psi = proprio[..., self.heading, None]
+        psi = track.heading[..., None]
         heading = torch.cat([psi.cos(), psi.sin()], dim=-1)
         target = turn(track.origin + direction - track.position, direction)
         home = turn(track.origin - track.position, direction)
@@ -132,4 +136,4 @@ def _advance(track: Track, velocity: Tensor, direction: Tensor, terminated: Tens
     origin = torch.where(issued, torch.round(track.position - _BEHIND * before), track.origin)
     position = track.position + 0.5 * CONTROL_PERIOD * (track.velocity + velocity)
     elapsed = torch.where(terminated, torch.zeros_like(track.elapsed), track.elapsed) + 1
-    return Track(position, velocity, start, origin, elapsed, direction, before)
+    return Track(position, velocity, start, origin, elapsed, direction, before, track.heading)

@@ -139,6 +139,21 @@ def fresh_weights(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def ant_teacher(tmp_path_factory):
+    """Return weights of an untrained teacher of the ant."""
+    import torch
+
+    from mujoban_controller.privileged import PrivilegedPolicy
+    from mujoban_rl.weights import save_weights
+
+    torch.manual_seed(0)
+    policy = PrivilegedPolicy("ant")
+    path = tmp_path_factory.mktemp("ant") / "teacher.safetensors"
+    save_weights(path, policy, policy.config, {})
+    return path
+
+
+@pytest.fixture(scope="session")
 def oracles():
     """Return the stack of oracles."""
     return ORACLES

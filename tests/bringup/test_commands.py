@@ -175,6 +175,17 @@ def test_an_interrupted_recording_leaves_whole_bags_of_all_its_processes(tmp_pat
     assert len([message for bag in bags.iterdir() for message in open_bag(bag).messages()]) > 0
 
 
+def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capfd):
+    report, few = tmp_path / "out.json", ["--difficulty", 1, "--episodes", 1, "--time-limit", 20, "--body", "ant"]
+    oracles = ["--oracle", "estimator,termination,planner"]
+    assert run(evaluate, *few, *oracles, "--controller", ant_teacher, "--json", report) == 0
+    assert json.loads(report.read_text())["body"] == "ant"
+    capfd.readouterr()
+    assert run(evaluate, *few, *oracles) == 2
+    error = capfd.readouterr().err
+    assert "the controller was trained for the body ball: expected weights for ant" in error
+
+
 def test_levels_that_are_kept_for_tests_are_recorded_only_when_that_is_asked_for():
     assert recorded_seed(None, records=False, allow_test_seeds=False) == 0
     assert recorded_seed(7, records=False, allow_test_seeds=False) == 7

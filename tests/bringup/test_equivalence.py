@@ -14,7 +14,7 @@ from mujoban_sokoban.episodes import Episodes
 def rolled_out(stack, episodes, time_limit):
     """Return per tick (sequence, direction), torque and reward of the rollout with batch 1."""
     torch.set_num_threads(1)
-    world = World(1, max_boxes=episodes.max_boxes, time_limit=time_limit)
+    world = World(1, body=stack.body, max_boxes=episodes.max_boxes, time_limit=time_limit)
     return [
         (
             (int(t.decision.sequence[0]), int(t.decision.instruction[0])),
@@ -53,6 +53,11 @@ def test_networks_do_the_same_in_the_graph_as_in_process(play_graph, fresh_weigh
 def test_one_network_among_oracles_does_the_same(play_graph, oracles, fresh_weights, role):
     stack = Stack(oracles.choices | {role: fresh_weights.choices[role]}, look_around=5)
     assert_equal_runs(play_graph, stack, Episodes(1, 7, difficulty=1), 25)
+
+
+def test_an_ant_does_the_same_in_the_graph_as_in_process(play_graph, oracles, ant_teacher):
+    stack = Stack(oracles.choices | {"controller": Choice("controller", weights=ant_teacher)}, body="ant")
+    assert_equal_runs(play_graph, stack, Episodes(1, 3, difficulty=1), 30)
 
 
 def test_two_runs_of_the_graph_are_equal(play_graph, fresh_weights):

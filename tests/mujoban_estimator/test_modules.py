@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 import torch
 
-from mujoban_core.bodies import BALL
-from mujoban_core.grid import AGENT, BOX, Instruction
+from mujoban_core.bodies import ANT, BALL
+from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, Instruction
 from mujoban_core.interfaces import EstimatorInput, TerminationInput, renew_rows
 from mujoban_estimator.estimator import Belief, StateEstimator
+from mujoban_estimator.odometry import FEATURES, Odometry
 from mujoban_estimator.termination import ControlTermination
 from mujoban_rl.weights import WeightsError, load_weights, save_weights
 
@@ -156,9 +157,25 @@ def test_after_a_push_the_next_cell_counts_from_the_cell_that_was_reached(termin
     assert track.origin.tolist() == [[1.0, 0.0]] and track.elapsed.item() == 1
 
 
-def test_odometry_in_bits_equals_odometry_at_once(termination, rng):
-    odometry = termination.odometry
-    proprio = torch.from_numpy(rng.normal(size=(2, 20, BALL.proprio_size)).astype(np.float32))
+def test_a_body_without_a_compass_comes_back_to_where_it_began_after_a_circle():
+    odometry, ticks = Odometry(ANT), 200
+    proprio = torch.zeros(1, ticks, ANT.proprio_size)
+    proprio[..., 0] = 1.5
+    proprio[:, 1:, ANT.proprio.yaw_rate] = 2 * np.pi / (ticks * CONTROL_PERIOD)
+    stay, no = torch.zeros(1, ticks, dtype=torch.int64), torch.zeros(1, ticks, dtype=torch.bool)
+    half, _ = odometry(proprio[:, : ticks // 2], stay[:, : ticks // 2], no[:, : ticks // 2], odometry.initial(1))
+    _, there = odometry(proprio, stay, no, odometry.initial(1))
+    assert half.shape == (1, ticks // 2, FEATURES)
+    # A circle of 15 m, in cells of 3 m.
+    assert there.position.abs().max() < 0.05
+    _, far = odometry(proprio[:, : ticks // 2], stay[:, : ticks // 2], no[:, : ticks // 2], odometry.initial(1))
+    assert float(far.position.norm()) == pytest.approx(5.0 / np.pi, abs=0.05)
+
+
+@pytest.mark.parametrize("body", [BALL, ANT], ids=lambda body: body.name)
+def test_odometry_in_bits_equals_odometry_at_once(body, rng):
+    odometry = Odometry(body)
+    proprio = torch.from_numpy(rng.normal(size=(2, 20, body.proprio_size)).astype(np.float32))
     instruction = torch.from_numpy(rng.integers(0, 5, (2, 20)))
     terminated = torch.from_numpy(rng.random((2, 20)) < 0.2)
     whole, _ = odometry(proprio, instruction, terminated, odometry.initial(2))
