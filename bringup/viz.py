@@ -8,6 +8,7 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import Any, Final
 
 import numpy as np
@@ -16,9 +17,13 @@ from mujoban_msgs.msg import AbstractState
 from nav_msgs.msg import MapMetaData, OccupancyGrid
 from numpy.typing import NDArray
 from rclpy.node import Node
-from std_msgs.msg import ColorRGBA, Header
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import ColorRGBA, Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
+from bringup.frames import camera_transforms, robot_description, robot_transform
+from mujoban_core.bodies import BALL
 from mujoban_core.grid import CELL_SIZE, CHANNELS, TARGET, WALL, cell_to_xy
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
@@ -43,7 +48,8 @@ class VizNode(Node):
     """Publishes the four layers of the estimate as occupancy grids and the true scene as markers.
 
     Topics: `/viz/estimate/<layer>` and `/viz/ground_truth/<layer>` (nav_msgs/OccupancyGrid, percent, frame `map`) for
-    the layers wall, target, agent and box; `/viz/scene` (visualization_msgs/MarkerArray).
+    the layers wall, target, agent and box; `/viz/scene` (visualization_msgs/MarkerArray); `/robot_description` (URDF);
+    and, where `tf2_msgs` is installed, `/tf` and `/tf_static` (see `bringup.frames`).
     """
 
     def __init__(self, **options: Any) -> None:
@@ -57,6 +63,7 @@ class VizNode(Node):
             for source in ("estimate", "ground_truth")
             for name in CHANNELS
         }
+        self._describe()
         self._scene = self.create_publisher(MarkerArray, f"{PREFIX}/scene", 1)
         for topic, show in (
             (topics.ABSTRACT_STATE, self._on_estimate),
@@ -66,8 +73,27 @@ class VizNode(Node):
         ):
             listen(self, topic, show, qos=live_qos(), decode=checked(topic))
 
+    def _describe(self) -> None:
+        """Publish what stays as it is, for those who join at any time."""
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._description = self.create_publisher(String, "/robot_description", latched)
+        self._description.publish(String(data=robot_description(BALL)))
+        self._tf: Publisher | None = None
+        if find_spec("tf2_msgs") is None:
+            self.get_logger().info("tf2_msgs is not installed: /tf and /tf_static are left out")
+            return
+        from tf2_msgs.msg import TFMessage  # pyright: ignore[reportMissingImports]
+
+        self._make_tf = TFMessage
+        self._tf = self.create_publisher(TFMessage, "/tf", 100)
+        self._tf_static = self.create_publisher(TFMessage, "/tf_static", latched)
+        self._tf_static.publish(TFMessage(transforms=camera_transforms(BALL)))
+
     def _on_pose(self, message: Received) -> None:
         self._pose = message.content.pose
+        if self._tf is not None:
+            transform = robot_transform(message.content.header.stamp, message.content.pose)
+            self._tf.publish(self._make_tf(transforms=[transform]))
 
     def _on_boxes(self, message: Received) -> None:
         self._boxes = list(message.content.poses)

@@ -29,10 +29,13 @@ LATCHED_DEPTH: Final = 8
 """Messages that a late joiner of a latched topic receives at most; the last one is the latest."""
 
 MAP_FRAME: Final = "map"
-CAMERA_FRAME: Final = "camera"
+CAMERA_FRAME: Final = "camera_optical_frame"
 """Optical frame of the robot's camera: x right, y down, z forward."""
 TOP_CAMERA_FRAME: Final = "camera_top"
-BODY_FRAME: Final = "robot"
+CAMERA_LINK: Final = "camera_link"
+"""The robot's camera: x forward along its axis, y left, z up."""
+BODY_FRAME: Final = "base_link"
+"""The robot: on the floor below its vertical axis, x along its heading."""
 
 
 @dataclass(frozen=True, eq=False)

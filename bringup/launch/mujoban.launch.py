@@ -1,0 +1,56 @@
+"""`ros2 launch bringup/launch/mujoban.launch.py [module:=oracle] [viz:=false]`: the graph, a process for each node.
+
+For those who have ROS 2; `python bringup/run_stack.py --processes` does the same without it, and restarts nodes.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from launch import LaunchDescription  # pyright: ignore
+from launch.actions import DeclareLaunchArgument, ExecuteProcess  # pyright: ignore
+from launch.conditions import IfCondition  # pyright: ignore
+from launch.substitutions import LaunchConfiguration  # pyright: ignore
+
+ROOT = Path(__file__).resolve().parents[2]
+MODULES = {
+    "estimator": "mujoban_estimator.node",
+    "termination": "mujoban_estimator.termination_node",
+    "planner": "mujoban_planner.node",
+    "controller": "mujoban_controller.node",
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return the nodes of the graph, with the parameters of bringup/config/stack.yaml."""
+    arguments = {
+        "python": (sys.executable, "interpreter of the environment that has mujoban"),
+        "params_file": (str(ROOT / "bringup/config/stack.yaml"), "parameters of the nodes"),
+        "module": ("learned", "what plays the four modules: learned or oracle"),
+        "difficulty": ("5", "of the levels"),
+        "realtime": ("1.0", "simulated seconds per second; 0.0 is lockstep"),
+        "viz": ("true", "whether RViz and Foxglove get topics of their own"),
+    }
+    value = {name: LaunchConfiguration(name) for name in arguments}
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in arguments.items()
+    ]
+
+    def node(module: str, *parameters: object, **options: object) -> ExecuteProcess:
+        command = [value["python"], "-m", module, "--ros-args", "--params-file", value["params_file"], *parameters]
+        return ExecuteProcess(cmd=command, cwd=str(ROOT), output="screen", **options)
+
+    return LaunchDescription(
+        [
+            *declared,
+            node(
+                "mujoban_sim.node",
+                "-p", ["difficulty:=", value["difficulty"]],
+                "-p", ["realtime:=", value["realtime"]],
+            ),
+            *(node(module, "-p", ["module:=", value["module"]]) for module in MODULES.values()),
+            node("bringup.viz", condition=IfCondition(value["viz"])),
+        ]
+    )  # fmt: skip
