@@ -1,0 +1,177 @@
+"""What bad input does to a run and to readers: `python -m benchmarks.fuzz [--messages N]` prints JSON.
+
+A run of the graph in a process of its own, in lockstep and in real time, is heard and answered by a node that says
+again, spoiled, whatever is said on every topic (`benchmarks.malformed`), and calls every service. Before, copies of a
+bag, of weights and of levels are damaged, one bit or one cut each, and read: each must be refused by name, or hold what
+it held before. Levels are plain text without a checksum: a file that was cut between two of them is a shorter one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+import tyro
+from rclpy.executors import SingleThreadedExecutor
+from std_srvs.srv import SetBool, Trigger
+
+import mujoban_planner
+from benchmarks.malformed import Vandal
+from bringup.run_stack import main as play
+from mujoban_msgs_py.bags import open_bag
+from mujoban_rl.weights import record_path
+from mujoban_sokoban.generator import generate_level
+from mujoban_sokoban.levels import read_levels, write_levels
+
+ROOT = Path(__file__).parents[1]
+MODES: dict[str, list[str]] = {"lockstep": [], "real time": ["--realtime", "4"]}
+HANG = 30.0
+"""Seconds without a tick that count as a hang."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How much is tried."""
+
+    messages: int = 10_000
+    """On each topic, in each mode."""
+    rate: float = 500.0
+    """Of them a second and topic."""
+    bags: int = 200
+    weights: int = 100
+    levels: int = 100
+    seed: int = 0
+
+
+def attack(mode: str, options: Options) -> dict[str, Any]:
+    """Return what became of a run that was attacked."""
+    os.environ["ROS_DOMAIN_ID"] = str(random.Random(mode).randrange(60, 100))
+    oracles = ["--oracle", "estimator,termination,planner,controller"]
+    command = [sys.executable, "bringup/run_stack.py", "--headless", "--episodes", "100000", *oracles, *MODES[mode]]
+    with tempfile.TemporaryFile("w+") as said:
+        child = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said)
+        report = {"mode": mode, **_attack(child, options)}
+        said.seek(0)
+        text = said.read()
+    report["tracebacks"] = text.count("Traceback")
+    report["named"] = sorted(set(re.findall(r"rejected a message on (\S+):", text)))
+    return report
+
+
+def _attack(child: subprocess.Popen[bytes], options: Options) -> dict[str, Any]:
+    rclpy.init()
+    vandal = Vandal(np.random.default_rng(options.seed))
+    executor = SingleThreadedExecutor()
+    executor.add_node(vandal)
+
+    def spin(seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.01)
+
+    spin(20.0)
+    first, hangs, heard, since = _memory(child.pid), 0, vandal.heard, time.monotonic()
+    while child.poll() is None and vandal.sent["/clock"] < options.messages:
+        burst = 10
+        vandal.act(burst)
+        spin(burst / options.rate)
+        if vandal.heard != heard:
+            heard, since = vandal.heard, time.monotonic()
+        elif time.monotonic() - since > HANG:
+            hangs, since = hangs + 1, time.monotonic()
+        if vandal.sent["/clock"] % 1000 == 0:
+            _call_services(vandal)
+    last, before = _memory(child.pid), vandal.heard
+    spin(5.0)
+    goes_on = vandal.heard > before
+    status = child.poll()
+    if status is None:
+        child.send_signal(signal.SIGINT)
+    child.wait(60)
+    rclpy.shutdown()
+    return {
+        "messages": sum(vandal.sent.values()), "crashed": status is not None, "hangs": hangs, "goes_on": goes_on,
+        "status": child.returncode, "megabytes_before": first, "megabytes_after": last,
+    }  # fmt: skip
+
+
+def _call_services(vandal: Vandal) -> None:
+    for name, kind, request in (
+        ("/pause", SetBool, SetBool.Request(data=True)), ("/step", Trigger, Trigger.Request()),
+        ("/reset", Trigger, Trigger.Request()), ("/pause", SetBool, SetBool.Request(data=False)),
+    ):  # fmt: skip
+        vandal.create_client(kind, name).call_async(request)
+
+
+def _memory(pid: int) -> int:
+    """Return the resident memory of a process in megabytes."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except (OSError, IndexError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE") >> 20
+
+
+def damage(paths: list[Path], read: Callable[[], Any], count: int, rng: np.random.Generator) -> Counter[str]:
+    """Damage one of some files, read them, and mend it again; return how often what happened."""
+    whole, outcomes = {path: path.read_bytes() for path in paths}, Counter[str]()
+    expected = read()
+    for trial in range(count):
+        path = paths[trial % len(paths)]
+        data = bytearray(whole[path])
+        if trial % 3 == 2:
+            del data[int(rng.integers(len(data))) :]
+        else:
+            data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+        path.write_bytes(data)
+        try:
+            outcomes["harmless" if read() == expected else "silently used"] += 1
+        except (ValueError, OSError) as error:
+            outcomes["named" if str(path.parent) in str(error) else "refused without a name"] += 1
+        except Exception as error:
+            outcomes[f"crashed: {type(error).__name__}"] += 1
+        path.write_bytes(whole[path])
+    return outcomes
+
+
+def files(options: Options) -> dict[str, dict[str, int]]:
+    """Return what became of damaged bags, weights and levels."""
+    rng = np.random.default_rng(options.seed)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        oracles = ["--oracle", "estimator,termination,planner,controller"]
+        play(["--headless", "--difficulty", "1", "--record", str(folder / "bag"), *oracles])
+        for path in (mujoban_planner.SHIPPED, record_path(mujoban_planner.SHIPPED)):
+            shutil.copy(path, folder)
+        weights, levels = folder / mujoban_planner.SHIPPED.name, folder / "levels.txt"
+        write_levels(levels, [generate_level(5, seed) for seed in range(8)])
+        bag = [folder / "bag" / "metadata.yaml", folder / "bag" / "bag_0.mcap"]
+        return {
+            "bags": damage(bag, lambda: [(m.topic, m.stamp, m.data) for m in open_bag(bag[0].parent).messages()],
+                           options.bags, rng),
+            "weights": damage([weights, record_path(weights)],
+                              lambda: [float(p.sum()) for p in mujoban_planner.load(weights).parameters()],
+                              options.weights, rng),
+            "levels": damage([levels], lambda: [level.to_text() for level in read_levels(levels)], options.levels, rng),
+        }  # fmt: skip
+
+
+if __name__ == "__main__":
+    chosen = tyro.cli(Options)
+    report = {"options": asdict(chosen), "files": files(chosen), "runs": [attack(mode, chosen) for mode in MODES]}
+    print(json.dumps(report, indent=2))
