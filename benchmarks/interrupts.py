@@ -212,7 +212,7 @@ def attempt(mode: str, number: signal.Signals, terminal: bool, cpu_seconds: floa
         time.sleep(0.02)
     seconds = time.monotonic() - start
     if seconds > LIMIT:
-        faults.append(f"took {seconds:.1f} s")
+        faults.append(f"took {seconds:.1f} s, {cpu_seconds:.1f} CPU seconds after the start: {run.last_words}")
     faults += [f"left a process: {member.name}" for member in members if member.lives]
     expected = -number if number == signal.SIGKILL else 128 + number
     if status != expected:

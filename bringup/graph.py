@@ -119,8 +119,14 @@ class Processes:
         restarts: How often each node was started again.
     """
 
-    def __init__(self, parameters: Parameters) -> None:
-        """Start the nodes with these parameters."""
+    def __init__(self, parameters: Parameters, *, restart_limit: int = RESTART_LIMIT) -> None:
+        """Start the nodes.
+
+        Args:
+            parameters: Of each node.
+            restart_limit: Times that a node is started again before the graph is given up.
+        """
+        self._restart_limit = restart_limit
         self.restarts: Counter[str] = Counter()
         self._directory = tempfile.TemporaryDirectory(prefix="mujoban-")
         folder = Path(self._directory.name)
@@ -154,8 +160,9 @@ class Processes:
                 continue
             if status == USAGE_ERROR:
                 raise GraphError(f"the {name} node could not start")
-            if self.restarts[name] == RESTART_LIMIT:
-                raise GraphError(f"the {name} node has ended {RESTART_LIMIT + 1} times, with status {status} at last")
+            if self.restarts[name] == self._restart_limit:
+                times = self._restart_limit + 1
+                raise GraphError(f"the {name} node has ended {times} times, with status {status} at last")
             self.restarts[name] += 1
             self._children[name] = self._start(name)
 

@@ -103,7 +103,7 @@ def play(
         top_camera_size=FRAME_SIZE if options.video is None else EDGE,
     )
     with ExitStack() as exits:
-        stop = exits.enter_context(StopSignal())
+        stop = exits.enter_context(StopSignal(deferred=False))
         set_threads(stack.threads)
         clear_shared_memory()
         exits.enter_context(claim_domain())
@@ -113,6 +113,7 @@ def play(
         for role in () if options.processes else ROLES:
             check_body(role, graph.nodes[role].module, stack.body)  # pyright: ignore[reportAttributeAccessIssue]
         monitor = graph.add(MonitorNode(len(episodes)))
+        stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:
             listeners.append(graph.add(_recorder(options.record, options.episodes_per_file)))

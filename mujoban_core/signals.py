@@ -88,9 +88,11 @@ class StopSignal:
 
     Attributes:
         number: The first signal that came, or None.
+        deferred: Whether signals wait for the work; while it is false, the first one raises `Interrupted` at once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, deferred: bool = True) -> None:
+        self.deferred = deferred
         self.number: int | None = None
         self._at = 0.0
         self._raised = False
@@ -145,7 +147,7 @@ class StopSignal:
     def _handler(self, number: int, frame: FrameType | None) -> None:
         again = self.requested and number == signal.SIGINT and time.monotonic() - self._at > AGAIN
         self._note(number)
-        if again and not self._raised:
+        if (again or not self.deferred) and not self._raised:
             self._raised = True
             raise Interrupted(number)
 

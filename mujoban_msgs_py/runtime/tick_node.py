@@ -239,9 +239,10 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     end_with_parent()
     node = None
     try:
-        with interruptible(), StopSignal() as stop:
+        with interruptible(), StopSignal(deferred=False) as stop:
             init_ros(args)
             node = make()
+            stop.deferred = True
             executor = EventsExecutor()
             executor.add_node(node)
             spin(executor, Future(), stop)

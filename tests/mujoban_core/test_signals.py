@@ -39,6 +39,15 @@ def test_a_ctrl_c_that_is_delivered_twice_counts_once():
         assert stop.requested
 
 
+def test_before_there_is_anything_to_put_away_a_signal_interrupts_once():
+    with StopSignal(deferred=False), pytest.raises(Interrupted):
+        os.kill(os.getpid(), signal.SIGTERM)
+    with StopSignal(deferred=False) as stop:
+        stop.deferred = True
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.requested
+
+
 def test_work_that_waits_outside_of_python_is_woken():
     woken = threading.Event()
     with StopSignal() as stop, stop.waking(woken.set):
