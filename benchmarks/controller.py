@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import time
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -74,7 +74,7 @@ def training_rates(rounds: int) -> dict[str, float]:
     stages = {
         "ppo": TrainConfig(algorithm="ppo"),
         "mpo": TrainConfig(algorithm="mpo"),
-        "camera_mpo": TrainConfig(stage="mpo"),
+        "camera_mpo": TrainConfig(stage="mpo", asymmetric=replace(TrainConfig().asymmetric, first=2_048)),
     }
     rates = {}
     with TemporaryDirectory() as folder:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -69,9 +70,17 @@ def make_driver(options: Options) -> tuple[Driver | Controller, str]:
         return scripted_driver, "scripted"
     if options.driver == "teacher" and options.weights is not None:
         policy = load_weights(PrivilegedPolicy, options.weights, options.device)
+        _check_body(policy.config, options)
         return PrivilegedDriver(policy), digest(options.weights)
     weights = options.weights or SHIPPED
-    return load_weights(VisuomotorController, weights, options.device), digest(weights)
+    controller = load_weights(VisuomotorController, weights, options.device)
+    _check_body(controller.config, options)
+    return controller, digest(weights)
+
+
+def _check_body(config: Mapping[str, object], options: Options) -> None:
+    if config["body"] != options.body:
+        raise ValueError(f"--body {options.body}: the weights are of the body {config['body']}")
 
 
 def main() -> int:

@@ -76,11 +76,12 @@ class MPOTrainingConfig:
             raise ValueError(f"window {self.window}: expected more ticks than n_step {self.n_step}")
 
 
-def policy_over(policy: Policy, batch: Mapping[str, Tensor]) -> Gaussian:
-    """Return the policy's distributions along windows, [M, W, U]."""
+def policy_over(policy: Policy, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
+    """Return the policy's distributions in the ticks of windows from number `skipped` on, [M, W - n, U]."""
     if isinstance(policy, PrivilegedPolicy):
-        return policy(batch["features"])
-    return policy(*(batch[k] for k in INPUT_FIELDS), memory_of(batch), batch["first"]).action
+        return policy(batch["features"][:, skipped:])
+    whole = policy(*(batch[k] for k in INPUT_FIELDS), memory_of(batch), batch["first"]).action
+    return Gaussian(whole.mean[:, skipped:], whole.scale[:, skipped:])
 
 
 class MPOLearner(ProductLearner[Batch]):
@@ -141,17 +142,16 @@ class MPOLearner(ProductLearner[Batch]):
         """Take one step of the critic, and one of the policy unless the batch was refused."""
         config = self.config
         with torch.no_grad():
-            target = policy_over(self.target_policy, batch)
-            noise = torch.randn((config.samples, *target.mean[:, config.n_step :].shape), generator=self._generator)
-            late = Gaussian(target.mean[:, config.n_step :], target.scale[:, config.n_step :])
+            target = policy_over(self.target_policy, batch, config.n_step)
+            noise = torch.randn((config.samples, *target.mean.shape), generator=self._generator)
             # Shapes [N, M, W - n, U] and [N, M, W - n].
-            action = late.mean + late.scale * noise
+            action = target.mean + target.scale * noise
             q = self.target_critic(batch["features"][:, config.n_step :], self._as_seen(action, batch))
         loss = self._critic_loss(batch, q.mean(0))
         stats = {"loss/critic": float(loss.detach())}
         accepted = guarded_step(loss, [self._critic_adam], guard, clip=config.clip) is not None
         if accepted and self._updates >= config.critic_first:
-            stats |= self._update_policy(batch, late, action, q, guard)
+            stats |= self._update_policy(batch, target, action, q, guard)
         if accepted and self._updates < config.normalised:
             self._normalise(batch)
         self._updates += accepted
@@ -189,10 +189,9 @@ class MPOLearner(ProductLearner[Batch]):
     def _update_policy(
         self, batch: Batch, target: Gaussian, action: Tensor, q: Tensor, guard: NaNGuard
     ) -> dict[str, float]:
-        online = policy_over(self.policy, batch)
-        n = self.config.n_step
+        online = policy_over(self.policy, batch, self.config.n_step)
         loss, stats = self.loss(
-            (online.mean[:, n:].flatten(0, 1), online.scale[:, n:].flatten(0, 1)),
+            (online.mean.flatten(0, 1), online.scale.flatten(0, 1)),
             (target.mean.flatten(0, 1), target.scale.flatten(0, 1)),
             action.flatten(1, 2),
             q.flatten(1),
