@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from array import array
 from contextlib import suppress
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
+from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos
-from mujoban_msgs_py.topics import GRAPH_TOPICS, RECORDED, TICK, Topic
+from mujoban_msgs_py.topics import EPISODE, GRAPH_TOPICS, RECORDED, TICK, Topic
 
 TARGETS: Final = (*GRAPH_TOPICS.values(), RECORDED)
 """Topics that are attacked."""
@@ -19,6 +21,8 @@ KINDS: Final = ("garbage", "truncated", "flipped", "extended", "field", "field",
 """What is done to a message, in turns."""
 _NUMBERS: Final = (0.0, -0.0, 1.5, -1.0, 1e30, -1e30, float("nan"), float("inf"), -float("inf"))
 _INTEGERS: Final = (0, 1, 2, 5, 127, 255, 65535, 2**31 - 1, 2**32 - 1, 2**63 - 1, -1, -(2**31))
+_STEPS: Final = 100
+"""Ticks that may be missed between two that are heard."""
 _STAMPS: Final = (0, TICK // 2, TICK, -TICK, 10**15, 2**31 * 10**9 - 1)
 """Nanoseconds to move a stamp by."""
 
@@ -102,7 +106,7 @@ class Vandal(Node):
 
     Attributes:
         sent: Messages published so far, by topic.
-        heard: Messages of the graph heard so far.
+        heard: Ticks of the graph heard so far.
     """
 
     def __init__(self, rng: np.random.Generator, **options: Any) -> None:
@@ -112,9 +116,9 @@ class Vandal(Node):
         self._last: dict[str, bytes] = {topic.name: serialize_message(topic.type()) for topic in TARGETS}
         self._mouths = {topic.name: self.create_publisher(topic.type, topic.name, topic.qos) for topic in TARGETS}
         self.sent = dict.fromkeys(self._last, 0)
-        self.heard = 0
+        self.heard = self._tick = 0
         for topic in TARGETS:
-            self.create_subscription(topic.type, topic.name, self._hear(topic.name), live_qos(16), raw=True)
+            listen(self, topic, partial(self._hear, topic), qos=live_qos(16))
 
     def act(self, count: int = 1) -> None:
         """Publish so many spoiled messages on every topic."""
@@ -126,9 +130,9 @@ class Vandal(Node):
                     self._mouths[topic.name].publish(malform(kind, topic, self._last[topic.name], self._rng))
                 self.sent[topic.name] += 1
 
-    def _hear(self, name: str) -> Any:
-        def hear(message: bytes) -> None:
-            self._last[name] = message
+    def _hear(self, topic: Topic, message: Received) -> None:
+        self._last[topic.name] = message.raw
+        # It hears itself as well: the run goes on where /episode has a later tick, and one that can follow.
+        if topic is EPISODE and (not self._tick or self._tick < message.stamp <= self._tick + _STEPS * TICK):
+            self._tick = message.stamp
             self.heard += 1
-
-        return hear

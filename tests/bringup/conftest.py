@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import pytest
 from mujoban_msgs.msg import Episode, Instruction
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
 
 from bringup.command import Choice, Stack
 from bringup.graph import NODES, InProcess
@@ -17,7 +16,8 @@ from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_core.plugins import ROLES
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.conversions import stamp_of, torque_from_msg
+from mujoban_msgs_py.conversions import stamp_of
+from mujoban_msgs_py.listening import listen
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_sokoban.episodes import Episodes
 
@@ -42,7 +42,7 @@ class Tap(Node):
         self.said = Said()
         self.create_subscription(Episode, topics.EPISODE.name, self._episode, live_qos(1000))
         self.create_subscription(Instruction, topics.INSTRUCTION.name, self._instruction, live_qos(1000))
-        self.create_subscription(JointState, topics.TORQUE.name, self._torque, live_qos(1000))
+        listen(self, topics.TORQUE, self._torque, qos=live_qos(1000))
 
     def _episode(self, message):
         self.said.episodes[stamp_of(message)] = message
@@ -52,7 +52,7 @@ class Tap(Node):
         self.said.instruction[stamp_of(message)] = (message.sequence, message.direction)
 
     def _torque(self, message):
-        self.said.torque[stamp_of(message)] = torque_from_msg(message).tolist()
+        self.said.torque[message.stamp] = message.content.tolist()
 
 
 class Play:
