@@ -95,12 +95,15 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     stays there. Colours and textures are drawn anew for every episode; the skyline around stays the same.
 
     ## Action space
-    ``Box(-1, 1, (U,), float32)``: normalised torques, held for 50 ms (20 Hz). The ball has U = 2:
+    ``Box(-1, 1, (U,), float32)``: normalised controls of the body's actuators, held for 50 ms (20 Hz). The ball has
+    U = 2 motors, the ant 8 servos, hip and ankle of one leg after the other, counter-clockwise from the front left:
 
-    | index | joint | 1.0 means |
-    |---|---|---|
-    | 0 | roll: drives the ball forwards (+) or backwards | 20 N m |
-    | 1 | steer: turns the robot to its left (+) or right | 20 N m |
+    | body | index | joint | 1.0 means |
+    |---|---|---|---|
+    | ball | 0 | roll: drives the ball forwards (+) or backwards | 20 N m |
+    | ball | 1 | steer: turns the robot to its left (+) or right | 20 N m |
+    | ant | 0, 2, 4, 6 | hip: swings the leg to the robot's left (+) or right | towards 35 degrees, at most 40 N m |
+    | ant | 1, 3, 5, 7 | ankle: bends the shin down (+) or up | towards 75 degrees; -1.0: towards 25 |
 
     A torque that is NaN or outside [-1, 1] raises `mujoban_sim.checks.TorqueError`; wrap the environment in
     ``gymnasium.wrappers.ClipAction`` for policies without bounds.
@@ -112,7 +115,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     | key | space | meaning | sets |
     |---|---|---|---|
     | ``frame`` | uint8 (64, 64, 3) | first-person camera, RGB | default, privileged |
-    | ``proprio`` | float32 (P,) | proprioception, see `mujoban_core.bodies.ProprioSlices`; P = 16 | all |
+    | ``proprio`` | float32 (P,) | proprioception, see `mujoban_core.bodies.ProprioSlices`; P = 16 (ant: 28) | all |
     | ``pose`` | float32 (3,) | x, y, yaw of the robot | all |
     | ``velocity`` | float32 (3,) | vx, vy, yaw rate in the frame ``map`` | state, privileged |
     | ``box_position`` | float32 (K, 2) | box centres; absent boxes lie 100 m away | state, privileged |
@@ -131,7 +134,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
 
     ## Episode end
     - ``terminated``: every box is on a target at once.
-    - ``truncated``: the time limit (4,800 steps, 240 s).
+    - ``truncated``: the time limit (4,800 steps, 240 s; twice that for the ant, whose cells are 3 m wide).
 
     ## Info
     ``reset``: ``seed``, and ``level`` as a text. ``step``: ``solved`` and ``boxes_on_target``.

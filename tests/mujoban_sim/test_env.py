@@ -27,6 +27,14 @@ def test_gymnasiums_checker_passes(observations):
     env.close()
 
 
+@pytest.mark.filterwarnings("ignore:.*infinity.*")
+def test_the_ant_is_an_environment_as_well():
+    env = gymnasium.make("Mujoban-v0", difficulty=1, body="ant", world="reference", observations="state")
+    check_env(env.unwrapped)
+    assert env.action_space.shape == (8,) and env.observation_space["proprio"].shape == (28,)
+    env.close()
+
+
 def test_observations_have_the_documented_shapes():
     env = MujobanEnv(observations="privileged", difficulty=3)
     observation, info = env.reset(seed=3)
