@@ -151,7 +151,7 @@ def test_an_interrupted_run_leaves_a_whole_bag(tmp_path, number):
     root = Path(run_stack.__file__).parents[1]
     process = subprocess.Popen([*command, "--record", str(bag)], cwd=root, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not any(file.stat().st_size > 1e6 for file in bag.glob("*.mcap")) and time.monotonic() < deadline:
+    while not any(file.stat().st_size > 1e5 for file in bag.glob("*.mcap")) and time.monotonic() < deadline:
         time.sleep(0.1)
     process.send_signal(number)
     _, err = process.communicate(timeout=60)
