@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import tyro
@@ -128,6 +128,16 @@ class Run:
         else:
             self.process.send_signal(number)
 
+    def __enter__(self) -> Self:
+        """Return the run."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Kill the command if it has not ended."""
+        self.process.kill()
+        self.process.wait()
+        self.close()
+
     def close(self) -> None:
         """Close the terminal or the pipe."""
         if not self._hung_up.is_set():
@@ -193,7 +203,11 @@ def _cpu_seconds(pid: int) -> float:
 def attempt(mode: str, number: signal.Signals, terminal: bool, cpu_seconds: float, folder: Path) -> Try:
     """Start a command, interrupt it after some CPU time, and look at what is left."""
     bag = folder / "bag"
-    run = Run([sys.executable, *(str(bag) if part == "BAG" else part for part in MODES[mode])], terminal)
+    with Run([sys.executable, *(str(bag) if part == "BAG" else part for part in MODES[mode])], terminal) as run:
+        return _interrupt(run, number, cpu_seconds, bag)
+
+
+def _interrupt(run: Run, number: signal.Signals, cpu_seconds: float, bag: Path) -> Try:
     deadline = time.monotonic() + 20 * GIVE_UP
     while _cpu_seconds(run.process.pid) < cpu_seconds and run.process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
