@@ -1,0 +1,223 @@
+"""Make the weights of all four modules from nothing: `python -m bringup.train_all --hours 8 --run runs/all`.
+
+Bottom-up, as in the paper (section 2, Training): the controller (a teacher by reward, its camera policy by distillation
+and MPO); beside it the planner; bags of both with perfect sense; estimator and termination from these bags; bags of
+all four, and estimator and termination again from both. No weight that ships is read. Stop it at any time: the same
+command goes on. At the end stand `weights/` and `report.md` in the run's directory.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from bringup.pipeline import Pipeline, PipelineError, Stage
+from bringup.training_report import write_report
+from mujoban_core.signals import interrupt_status
+from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sokoban.generator import TRAIN_SEEDS, VALIDATION_SEEDS
+
+PROG = "mujoban.train_all"
+WEIGHTS: Final = {
+    "controller": "controller_mpo/controller.safetensors",
+    "planner": "planner/planner.safetensors",
+    "estimator": "estimator_second/weights/estimator.safetensors",
+    "termination": "estimator_second/weights/termination.safetensors",
+}
+"""Where in the run's directory the weights of each module stand."""
+SHARES: Final = {
+    "teacher": 0.05,
+    "controller_distil": 0.23,
+    "controller_mpo": 0.12,
+    "planner": 0.40,
+    "bags_first": 0.03,
+    "estimator_first": 0.19,
+    "bags_second": 0.03,
+    "estimator_second": 0.19,
+    "evaluation": 0.08,
+}
+"""Share of the hours that each stage gets. Controller and planner train side by side, on one core each."""
+_SAVED: Final = 0.92
+"""Of a stage's share goes into training; the rest into starting, judging and saving."""
+_EPISODES_PER_HOUR: Final = 90
+"""Recorded in each round, per hour of the whole run."""
+_RECORDED_STEPS: Final = 900
+"""Longest recorded episode."""
+_STREAMS: Final = {"bags_first": 1, "bags_second": 2}
+"""Each recording draws levels of its own, this many times a billion seeds into those for training."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train all four modules from nothing."""
+
+    run: Path = Path("runs/all")
+    """Directory of everything; an existing one is resumed."""
+    hours: float = 8.0
+    """Time that the whole run may take on two cores; the budgets of all stages scale with it."""
+    world: str = DEFAULT_WORLD
+    """Physical world: reference or eased."""
+    seed: int = 0
+    cores: int = 2
+    evaluation_episodes: int = 128
+    """Validation levels that each table of the report counts."""
+
+    def __post_init__(self) -> None:
+        """Reject times in which nothing can be learned."""
+        if not self.hours > 0:
+            raise ValueError(f"--hours {self.hours}: expected a positive number")
+
+
+def stages(options: Options) -> list[Stage]:
+    """Return all stages of a run, each after what it needs."""
+    return [*_controller(options), *_planner(options), *_senses(options), _evaluation(options)]
+
+
+def _seconds(options: Options, name: str) -> float:
+    return SHARES[name] * options.hours * 3600.0
+
+
+def _trainer(options: Options, name: str, command: Sequence[str], product: str, *needs: str, cores: int = 1) -> Stage:
+    seconds = _seconds(options, name)
+    budget = ("--budget-seconds", str(round(_SAVED * seconds)))
+    folder = options.run / name
+    arguments = ("-m", *command, "--run", str(folder), *budget)
+    return Stage(name, arguments, (options.run / product,), needs, seconds, cores)
+
+
+def _controller(options: Options) -> list[Stage]:
+    run = options.run
+    common = ("--seed", str(options.seed), "--task.world", options.world)
+    teacher, student = "teacher/teacher.safetensors", "controller_distil/controller.safetensors"
+    train = "mujoban_controller.train"
+    return [
+        _trainer(options, "teacher", (train, "--stage", "teacher", *common), teacher),
+        _trainer(
+            options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common),
+            student, "teacher",
+        ),
+        _trainer(
+            options, "controller_mpo", (train, "--stage", "mpo", "--initial", str(run / student), *common),
+            WEIGHTS["controller"], "controller_distil",
+        ),
+    ]  # fmt: skip
+
+
+def _planner(options: Options) -> list[Stage]:
+    command = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.seed))
+    return [_trainer(options, "planner", command, WEIGHTS["planner"])]
+
+
+def _senses(options: Options) -> list[Stage]:
+    found = []
+    bags: list[str] = []
+    acting = ("controller_mpo", "planner")
+    for round_, sense in (("first", ("--oracle", "estimator,termination")), ("second", _modules(options, "first"))):
+        recording = f"bags_{round_}"
+        needs = acting if round_ == "first" else (*acting, "estimator_first")
+        found.append(_recording(options, recording, sense, needs))
+        bags.append(str(options.run / recording))
+        name = f"estimator_{round_}"
+        out = options.run / name / "weights"
+        command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out), "--threads", str(options.cores)]
+        command += ["--config.seed", str(options.seed)]
+        if round_ == "second":
+            command += ["--start", str(options.run / "estimator_first" / "weights")]
+        found.append(_trainer(options, name, command, f"{name}/weights", recording, cores=options.cores))
+    return found
+
+
+def _modules(options: Options, round_: str) -> tuple[str, ...]:
+    folder = options.run / f"estimator_{round_}" / "weights"
+    return tuple(x for role in ("estimator", "termination") for x in (f"--{role}", str(folder / f"{role}.safetensors")))
+
+
+def _recording(options: Options, name: str, sense: tuple[str, ...], needs: tuple[str, ...]) -> Stage:
+    run = options.run
+    episodes = max(8, round(_EPISODES_PER_HOUR * options.hours))
+    acting = tuple(x for role in ("controller", "planner") for x in (f"--{role}", str(run / WEIGHTS[role])))
+    command = (
+        "-m", "bringup.record", "--out", str(run / name), "--episodes", str(episodes),
+        "--seed", str(TRAIN_SEEDS.start + _STREAMS[name] * 10**9), "--time-limit", str(_RECORDED_STEPS),
+        "--processes", str(options.cores), "--world", options.world, *sense, *acting,
+    )  # fmt: skip
+    return Stage(name, command, (run / name,), needs, _seconds(options, name), options.cores)
+
+
+def _evaluation(options: Options) -> Stage:
+    run = options.run
+    weights = tuple(x for role, path in WEIGHTS.items() for x in (f"--{role}", str(run / path)))
+    command = (
+        "-m", "bringup.evaluate", "--difficulty", "5", "--episodes", str(options.evaluation_episodes),
+        "--seed", str(VALIDATION_SEEDS.start), "--world", options.world, "--json", str(run / "evaluation.json"),
+        *weights,
+    )  # fmt: skip
+    needs = ("estimator_second", "planner", "controller_mpo")
+    return Stage(
+        "evaluation", command, (run / "evaluation.json",), needs, _seconds(options, "evaluation"), options.cores
+    )
+
+
+class _Display:
+    """A line a stage: what it has taken of what it may take."""
+
+    def __init__(self, pipeline: Pipeline, console: Console) -> None:
+        columns = (TextColumn("{task.description:18}"), BarColumn(), TextColumn("{task.fields[note]}"))
+        self.progress = Progress(*columns, console=console, refresh_per_second=1)
+        self._tasks: dict[str, TaskID] = {
+            s.name: self.progress.add_task(s.name, total=s.seconds, note="waits") for s in pipeline.stages
+        }
+
+    def update(self, pipeline: Pipeline) -> None:
+        """Show how far every stage is."""
+        for stage in pipeline.stages:
+            spent, done = pipeline.elapsed(stage.name), pipeline.entries[stage.name].done
+            if done:
+                note = f"done in {_minutes(spent)}"
+            elif stage.name in pipeline.running():
+                note = f"{_minutes(spent)} of about {_minutes(stage.seconds)}"
+            else:
+                note = "waits"
+            shown = stage.seconds if done else min(spent, stage.seconds)
+            self.progress.update(self._tasks[stage.name], completed=shown, note=note)
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s"
+
+
+def train_all(options: Options) -> bool:
+    """Run all stages that are not done yet, then write the report; return whether everything is done.
+
+    Raises:
+        PipelineError: If a stage fails.
+    """
+    pipeline = Pipeline(options.run, stages(options), cores=options.cores)
+    display = _Display(pipeline, Console(stderr=True))
+    with display.progress:
+        done = pipeline.run(display.update)
+        display.update(pipeline)
+    if done:
+        print(write_report(options.run, pipeline, WEIGHTS))
+    return done
+
+
+def main() -> int:
+    """Run the command."""
+    try:
+        options = tyro.cli(Annotated[Options, tyro.conf.arg(name="")], prog=PROG, description=__doc__)
+        return 0 if train_all(options) else interrupt_status()
+    except (ValueError, OSError, PipelineError) as error:
+        print(f"{PROG}: error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""The report of a run of `bringup.train_all`: what each stage took, learned and came from, with its curves."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+from bringup.pipeline import Pipeline
+from mujoban_core.files import write_atomically
+
+_PREFIX = "evaluation/"
+
+
+def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> Path:
+    """Collect the weights in `weights/`, draw the curves, and write `report.md`; return its path."""
+    for role, name in weights.items():
+        for source in ((run / name), (run / name).with_suffix(".json")):
+            target = run / "weights" / f"{role}{source.suffix}"
+            target.parent.mkdir(exist_ok=True)
+            shutil.copyfile(source, target)
+    figure = draw_curves(run, [s.name for s in pipeline.stages], run / "curves.png")
+    lines = [*_summary(run, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
+    if figure:
+        lines += ["", "![Validation scores against CPU seconds](curves.png)"]
+    path = run / "report.md"
+    write_atomically(path, ("\n".join(lines) + "\n").encode())
+    return path
+
+
+def evaluations(metrics: Path) -> dict[str, list[tuple[float, float]]]:
+    """Return the curves of a run's `metrics.jsonl`: pairs of CPU seconds and score, by the score's name."""
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for line in metrics.read_text().splitlines():
+        values = json.loads(line)
+        for name, value in values.items():
+            if name.startswith(_PREFIX) and value is not None:
+                curves.setdefault(name.removeprefix(_PREFIX), []).append((values["cpu_seconds"], value))
+    return curves
+
+
+def draw_curves(run: Path, names: list[str], path: Path) -> bool:
+    """Draw the validation curves of all trainings, one panel each; return whether there are any."""
+    found = {name: curves for name in names if (curves := _rates(run / name / "metrics.jsonl"))}
+    if not found:
+        return False
+    figure, axes = plt.subplots(1, len(found), figsize=(4.2 * len(found), 3.4), squeeze=False)
+    for axis, (name, curves) in zip(axes[0], found.items(), strict=True):
+        for label, points in curves.items():
+            axis.plot(*zip(*points, strict=True), label=label, marker=".")
+        axis.set(title=name.replace("_", " "), xlabel="CPU seconds of all processes", ylim=(0.0, 1.02))
+        axis.legend(fontsize=7)
+    axes[0][0].set_ylabel("rate on validation levels")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return True
+
+
+def _rates(metrics: Path) -> dict[str, list[tuple[float, float]]]:
+    """Return the curves that stay within [0, 1], which are rates."""
+    if not metrics.exists():
+        return {}
+    return {k: v for k, v in evaluations(metrics).items() if all(0.0 <= y <= 1.0 for _, y in v)}
+
+
+def _summary(run: Path, pipeline: Pipeline) -> Iterator[str]:
+    hours = sum(entry.seconds for entry in pipeline.entries.values()) / 3600
+    yield "# Weights from nothing"
+    yield ""
+    yield f"All stages together took {hours:.2f} hours of wall-clock, some of them side by side."
+    evaluation = run / "evaluation.json"
+    if evaluation.exists():
+        report = json.loads(evaluation.read_text())
+        low, high = report["success_interval"]
+        yield ""
+        yield (
+            f"The four modules solve **{report['success_rate']:.1%}** of {len(report['episodes'])} validation levels "
+            f"of difficulty 5 (95 % interval {low:.1%} to {high:.1%}), mean return {report['mean_return']:.2f}. "
+            f"Failures: {', '.join(f'{v} {k}' for k, v in report['failures'].items()) or 'none'}."
+        )
+
+
+def _stages(run: Path, pipeline: Pipeline) -> Iterator[str]:
+    yield ""
+    yield "| stage | minutes | samples | updates | last validation |"
+    yield "|---|---|---|---|---|"
+    for stage in pipeline.stages:
+        record = _record(run, stage.products)
+        scores = ", ".join(f"{k} {v:.3g}" for k, v in record.get("metrics", {}).items() if isinstance(v, (int, float)))
+        cells = (
+            stage.name, f"{pipeline.entries[stage.name].seconds / 60:.1f}",
+            str(record.get("samples", "")), str(record.get("updates", "")), scores,
+        )  # fmt: skip
+        yield f"| {' | '.join(cells)} |"
+
+
+def _record(run: Path, products: tuple[Path, ...]) -> dict[str, Any]:
+    """Return the record of the weights that a stage made, if it made weights."""
+    for product in products:
+        records = sorted(product.glob("*.json")) if product.is_dir() else [product.with_suffix(".json")]
+        for file in records:
+            if file.exists() and file.with_suffix(".safetensors").exists():
+                return json.loads(file.read_text())
+    return {}
+
+
+def _origins(pipeline: Pipeline) -> Iterator[str]:
+    yield ""
+    yield "## Commands, and what each came from"
+    for stage in pipeline.stages:
+        entry = pipeline.entries[stage.name]
+        yield ""
+        yield f"- **{stage.name}**: `python {' '.join(entry.command)}`"
+        for direction, digests in (("from", entry.inputs), ("made", entry.outputs)):
+            for name, digest in digests.items():
+                yield f"  - {direction} `{name}`, SHA-256 {digest[:16]}"
