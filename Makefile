@@ -3,6 +3,7 @@
 # make results  the tables and figures of the paper, the model cards
 # make docs   the API reference, in build/docs
 # make test   the test suite                       make colcon  the messages as colcon builds them
+# make weights  all weights from nothing, as in: make weights ARGS="--hours 8 --run runs/all"
 #
 # PYTHON chooses the interpreter for .venv; ARGS are passed on, as in: make run ARGS="--difficulty 1"
 
@@ -20,7 +21,7 @@ COLCON_WHEELS := colcon-common-extensions cmake ninja ros-jazzy-rclpy[fastrtps]=
   'ros-ament-cmake-include-directories<2.6' ros-ament-package ros-python-cmake-module 'empy<4' \
   ros-ament-cmake-gtest ros-ament-cmake-gmock ros-ament-cmake-pytest
 
-.PHONY: setup run test lint bench results docs colcon clean
+.PHONY: setup run test lint bench results docs weights colcon clean
 
 setup: $(STAMP)
 
@@ -40,6 +41,9 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+weights: $(STAMP)
+	$(BIN)/python -m bringup.train_all $(ARGS)
 
 results: $(STAMP)
 	$(BIN)/python -m benchmarks.paper

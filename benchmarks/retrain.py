@@ -95,7 +95,7 @@ def run(options: Options) -> dict[str, Any]:
     execute(*record, "--out", held_out, "--episodes", 16, "--seed", VALIDATION_SEEDS.start + 500_000, *oracles)
     execute(
         *train, "--bags", first, "--run", options.run / "train_weak", "--out", weak,
-        "--config.steps", options.weak_steps,
+        "--steps", options.weak_steps,
     )  # fmt: skip
     seconds = {
         "record": execute(
@@ -103,7 +103,7 @@ def run(options: Options) -> dict[str, Any]:
         ),
         "train": execute(
             *train, "--bags", own, "--start", weak, "--run", options.run / "train_better", "--out", better,
-            "--config.steps", options.steps, "--seconds", options.seconds,
+            "--steps", options.steps, "--seconds", options.seconds,
         ),
     }  # fmt: skip
     largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20

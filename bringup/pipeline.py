@@ -123,29 +123,27 @@ class Pipeline:
         """Return the names of the stages that run now."""
         return list(self._running)
 
-    def run(self, on_tick: Callable[[Pipeline], None] | None = None) -> bool:
-        """Run what is not done yet; SIGINT and SIGTERM stop the commands, which keep their checkpoints.
+    def run(self, on_tick: Callable[[Pipeline], None] | None = None) -> None:
+        """Run what is not done yet.
 
         Args:
             on_tick: Called several times a second, to show progress.
 
-        Returns:
-            Whether every stage is done.
-
         Raises:
             PipelineError: If a command fails or does not make what it should; the others are stopped.
+            Interrupted: If a signal came; the commands were stopped and have kept their checkpoints.
         """
-        try:
-            with StopSignal() as stop:
-                while not self.done and not stop.requested:
+        with StopSignal() as stop:
+            try:
+                while not self.done:
+                    stop.check()
                     self._start_ready()
                     self._reap()
                     if on_tick is not None:
                         on_tick(self)
                     time.sleep(_PERIOD)
-        finally:
-            self._stop_all()
-        return self.done
+            finally:
+                self._stop_all()
 
     def _start_ready(self) -> None:
         used = sum(s.cores for s in self.stages if s.name in self._running)
@@ -196,7 +194,7 @@ class Pipeline:
         self._save()
 
     def _stop_all(self) -> None:
-        children.stop((process for process, _ in self._running.values()), _GRACE)
+        children.stop([process for process, _ in self._running.values()], _GRACE)
         for name in self.running():
             self._finish(name)
 

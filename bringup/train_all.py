@@ -86,7 +86,7 @@ def _seconds(options: Options, name: str) -> float:
 
 def _trainer(options: Options, name: str, command: Sequence[str], product: str, *needs: str, cores: int = 1) -> Stage:
     seconds = _seconds(options, name)
-    budget = ("--budget-seconds", str(round(_SAVED * seconds)))
+    budget = ("--cpu-seconds", str(round(_SAVED * seconds * cores)))
     folder = options.run / name
     arguments = ("-m", *command, "--run", str(folder), *budget)
     return Stage(name, arguments, (options.run / product,), needs, seconds, cores)
@@ -127,7 +127,7 @@ def _senses(options: Options) -> list[Stage]:
         name = f"estimator_{round_}"
         out = options.run / name / "weights"
         command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out), "--threads", str(options.cores)]
-        command += ["--config.seed", str(options.seed)]
+        command += ["--seed", str(options.seed)]
         if round_ == "second":
             command += ["--start", str(options.run / "estimator_first" / "weights")]
         found.append(_trainer(options, name, command, f"{name}/weights", recording, cores=options.cores))
@@ -193,30 +193,32 @@ def _minutes(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s"
 
 
-def train_all(options: Options) -> bool:
-    """Run all stages that are not done yet, then write the report; return whether everything is done.
+def train_all(options: Options) -> Path:
+    """Run all stages that are not done yet, then write the report; return its path.
 
     Raises:
         PipelineError: If a stage fails.
+        Interrupted: If a signal came.
     """
     pipeline = Pipeline(options.run, stages(options), cores=options.cores)
     display = _Display(pipeline, Console(stderr=True))
     with display.progress:
-        done = pipeline.run(display.update)
+        pipeline.run(display.update)
         display.update(pipeline)
-    if done:
-        print(write_report(options.run, pipeline, WEIGHTS))
-    return done
+    return write_report(options.run, pipeline, WEIGHTS)
 
 
 def main() -> int:
     """Run the command."""
     try:
         options = tyro.cli(Annotated[Options, tyro.conf.arg(name="")], prog=PROG, description=__doc__)
-        return 0 if train_all(options) else interrupt_status()
+        print(train_all(options))
+    except KeyboardInterrupt as error:
+        return interrupt_status(error)
     except (ValueError, OSError, PipelineError) as error:
         print(f"{PROG}: error: {error}", file=sys.stderr)
         return 2
+    return 0
 
 
 if __name__ == "__main__":

@@ -59,6 +59,8 @@ class TrainConfig:
     """What teaches the teacher."""
     steps: int = 1_500_000
     """Environment steps of all robots together."""
+    cpu_seconds: float = 1e9
+    """CPU seconds of training at which the run is complete, if its steps have not come first."""
     seed: int = 0
     initial: Path | None = None
     """Weights to start from."""
@@ -220,7 +222,8 @@ def make_trainer(options: Options) -> Trainer[Any]:
         log_updates=20 if on_policy else 200, publish_updates=1 if on_policy else 10,
         evaluate_samples=options.evaluate_every, save_seconds=options.save_every,
     )  # fmt: skip
-    return Trainer(directory, learner, source, Budget(samples=config.steps), cadence, record=record)
+    budget = Budget(samples=config.steps, cpu_seconds=config.cpu_seconds)
+    return Trainer(directory, learner, source, budget, cadence, record=record)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -75,6 +75,8 @@ class TrainConfig:
     """Ticks of a stretch, a multiple of `update_every`."""
     steps: int = 20_000
     """Steps of the run, and of the learning-rate schedule."""
+    cpu_seconds: float = 1e9
+    """CPU seconds of training at which the run is complete, if its steps have not come first."""
     learning_rate: float = 1.5e-3
     warm_up: int = 50
     final_rate: float = 0.03

@@ -1,6 +1,6 @@
 """Train state estimator and control termination together from recorded bags (paper C.1, C.4).
 
-    python -m mujoban_estimator.train --bags bags/one bags/two --run runs/estimator --config.steps 20000
+    python -m mujoban_estimator.train --bags bags/one bags/two --run runs/estimator --steps 20000
 
 A run that is started again with the same directory goes on where it stopped.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 import tyro
@@ -38,7 +39,7 @@ class Options:
     """Folder that receives estimator.safetensors and termination.safetensors."""
     start: Path | None = None
     """Folder with weights of both modules to start a new run from."""
-    config: TrainConfig = field(default_factory=TrainConfig)
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     seconds: float | None = None
     """Stop, with a checkpoint, after this time."""
     threads: int = 1
@@ -83,9 +84,13 @@ def make_trainer(options: Options) -> Trainer[Batch]:
         "training": asdict(config),
     }
     return Trainer(
-        RunDirectory(options.run, config), learner, BagSource(reading, options.workers), Budget(updates=config.steps),
-        Cadence(log_updates=50, evaluate_samples=every, save_seconds=options.save_every), record=record,
-    )  # fmt: skip
+        RunDirectory(options.run, config),
+        learner,
+        BagSource(reading, options.workers),
+        Budget(updates=config.steps, cpu_seconds=config.cpu_seconds),
+        Cadence(log_updates=50, evaluate_samples=every, save_seconds=options.save_every),
+        record=record,
+    )
 
 
 def main() -> None:
