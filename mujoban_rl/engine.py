@@ -24,6 +24,7 @@ from typing import Any, Generic, TypeVar
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from mujoban_core import children
 from mujoban_core.signals import StopSignal
 from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.progress import Budget, Clock, Meter, Progress
@@ -204,6 +205,7 @@ class Trainer(Generic[BatchT]):
         Returns:
             Whether the run is complete.
         """
+        children.end_with_parent()
         samples = min(self.budget.samples, limit_samples)
         total = None if math.isinf(samples) else int(samples)
         limits = _Limits(TimeLimit(limit_seconds), limit_samples, limit_updates)
