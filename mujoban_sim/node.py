@@ -21,10 +21,10 @@ from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
+from mujoban_msgs_py.runtime.pace import Pace
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.observation import ObservationPublisher
-from mujoban_sim.pace import Pace
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.resume import Moment, MomentFile, Place
 from mujoban_sim.tick_messages import TickLabel

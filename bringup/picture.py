@@ -1,6 +1,6 @@
 """A picture of the world: what the robot sees at four moments of an episode, beside the view from above at the last.
 
-Run as ``python -m mujoban_sim.picture docs/images/world.png --seed 5``; the episode is played by the oracles.
+Run as ``python -m bringup.picture docs/images/world.png --seed 5``; the episode is played by the oracles.
 """
 
 from __future__ import annotations

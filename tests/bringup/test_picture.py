@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mujoban_sim.picture import main
+from bringup.picture import main
 
 
 def test_the_picture_shows_the_world_from_above_and_four_views_of_the_robot(tmp_path):

@@ -1,6 +1,6 @@
 """Real time: said at once when it is not kept, at most once a window, and never of lockstep."""
 
-from mujoban_sim.pace import WINDOW, Pace
+from mujoban_msgs_py.runtime.pace import WINDOW, Pace
 
 
 def play(pace, start, rate, late=0.0):
