@@ -118,7 +118,8 @@ class Stack:
     device: str = "cpu"
     look_around: int | None = None
     """Ticks of looking around at the start of an episode; None: `LOOK_AROUND_TICKS`, or 0 for the oracle estimator."""
-
+    look_ahead: int = 0
+    """Evaluations of the planner's tree search; 0 for none."""
     threads: int = 1
     """Threads of the networks in each process."""
 
@@ -136,13 +137,18 @@ class Stack:
         """Return the modules composed into one policy.
 
         Raises:
-            ValueError: If a module cannot be loaded or is of another body, or `look_around` is negative.
+            ValueError: If a module cannot be loaded or is of another body, `look_around` is negative, or the planner
+                cannot look ahead.
         """
         from mujoban_core.sense_plan_act import SensePlanAct
 
         modules = {role: choice.load(self.device) for role, choice in self.choices.items()}
         for role, module in modules.items():
             check_body(role, module, self.body)
+        if self.look_ahead:
+            from mujoban_planner.lookahead import look_ahead
+
+            modules["planner"] = look_ahead(modules["planner"], self.look_ahead)
         ticks = self.look_around_ticks
         return SensePlanAct(**{role: look_around(module, ticks) for role, module in modules.items()})  # pyright: ignore
 
@@ -207,6 +213,13 @@ def add_module_options(parser: argparse.ArgumentParser) -> None:
         help="look around before the first decision, and walk to where more can be seen: the length of each turn on "
         f"the spot, 0 for none; {LOOK_AROUND_TICKS} by default, 0 for the oracle estimator",
     )
+    parser.add_argument(
+        "--look-ahead",
+        type=positive,
+        default=0,
+        metavar="N",
+        help="let the learned planner search ahead by N evaluations of its network as the robot moves; off by default",
+    )
 
 
 def add_recording_options(parser: argparse.ArgumentParser) -> None:
@@ -264,6 +277,7 @@ def stack_from(arguments: argparse.Namespace) -> Stack:
     for role in filter(None, arguments.oracle.split(",")):
         if role not in ROLES:
             raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
+<<<<<<< HEAD
         choices[role] = _oracle(role, arguments.body)
     return Stack(choices, arguments.device, arguments.look_around, arguments.threads, arguments.body)
 
@@ -275,6 +289,9 @@ def _oracle(role: str, body: str) -> Choice:
 
         return Choice(role, LEARNED, teacher_weights(body))
     return Choice(role, ORACLE)
+=======
+        choices[role] = Choice(role, ORACLE)
+    return Stack(choices, arguments.device, arguments.look_around, arguments.look_ahead)
 
 
 def import_from_here(path: Sequence[str] = ("",)) -> None:

@@ -65,4 +65,5 @@ def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Para
         }
     for role in LOOKING_ROLES:
         parameters[role]["look_around"] = stack.look_around_ticks
+    parameters["planner"]["look_ahead"] = stack.look_ahead
     return parameters

@@ -240,6 +240,14 @@ class Planner(Module):
     ) -> tuple[NDArray[np.int64], Memory]:
         """Return a new instruction for each of M robots, [M], from [M, N, N, 4], and their next memory."""
 
+    thinks: bool = False
+    """Whether it uses ticks in which no decision is due (`think`)."""
+
+    def think(self, abstract_state: NDArray[np.float32], memory: Memory) -> Memory:
+        """Return the memory of M robots after a tick in which their instruction goes on; estimates [M, N, N, 4]."""
+        del abstract_state
+        return memory
+
     def initial_state(self, seeds: NDArray[np.int64]) -> PlannerState:
         """Return the state at the start of episodes with the given seeds, [B]."""
         batch = len(seeds)
@@ -249,7 +257,11 @@ class Planner(Module):
         self, abstract_state: NDArray[np.float32], terminated: NDArray[np.bool_], state: PlannerState
     ) -> tuple[NDArray[np.int64], PlannerState]:
         """Return A_t, [B]: a new decision where beta_t or where none is in force yet, else A_{t-1}."""
-        rows = np.flatnonzero(terminated | (state.instruction < 0))
+        due = terminated | (state.instruction < 0)
+        rows, others = np.flatnonzero(due), np.flatnonzero(~due)
+        if self.thinks and others.size:
+            thoughts = self.think(abstract_state[others], take_rows(state.memory, others))
+            state = state._replace(memory=put_rows(state.memory, others, thoughts))
         if rows.size == 0:
             return state.instruction, state
         decision, memory = self.decide(abstract_state[rows], take_rows(state.memory, rows))

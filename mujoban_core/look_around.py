@@ -67,6 +67,7 @@ class LookAroundPlanner(Planner):
         """Wrap `inner`; a look takes `ticks` ticks, and later looks and the way there `walks` instructions at most."""
         self.inner, self.ticks, self.walks = inner, ticks, walks
         self.privileged = inner.privileged
+        self.thinks = inner.thinks
 
     def initial_memory(self, batch: int) -> Memory:
         """Return the memory at the start of `batch` episodes, each of which begins with a look."""
@@ -99,6 +100,10 @@ class LookAroundPlanner(Planner):
             decision[rows], after = self.inner.decide(abstract_state[rows], take_rows(inner, rows))
             inner = put_rows(inner, rows, after)
         return decision, (*inner, tick, until, walks, seen)
+
+    def think(self, abstract_state: NDArray[np.float32], memory: Memory) -> Memory:
+        """Let the other planner think."""
+        return (*self.inner.think(abstract_state, tuple(memory[:-4])), *memory[-4:])
 
     def step(
         self, abstract_state: NDArray[np.float32], terminated: NDArray[np.bool_], state: PlannerState

@@ -78,6 +78,12 @@ class Trees(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def region_of(wall: Bits, box: Bits, agent: Int) -> Int:
+    """Return the lowest square that the robot can walk to: states that differ only within its region are alike."""
+    return lowest(flood(bit(agent), ~wall & ~box))
+
+
+@njit(cache=True, nogil=True)
 def _sift_up(heap: NDArray[np.int32], cost: NDArray[np.float32], size: Int, node: Int) -> None:
     """Add a node to a heap of `size` nodes."""
     i = size
@@ -147,7 +153,7 @@ def plant(
         trees.table[row] = -1
         trees.wall[row], trees.target[row] = wall[i], target[i]
         trees.nodes[row], trees.waiting[row], trees.expansions[row], trees.solution[row] = 0, 0, 0, -1
-        region = lowest(flood(bit(agent[i]), ~wall[i] & ~box[i]))
+        region = region_of(wall[i], box[i], agent[i])
         node = _add(trees, row, _find(trees, row, box[i], region), box[i], agent[i], region)
         trees.cost[row, node], trees.logp[row, node] = 0.0, 0.0
         trees.moves[row, node], trees.depth[row, node], trees.parent[row, node] = 0, 0, -1
@@ -222,7 +228,7 @@ def expand(
             after = pushed(box, square, direction)
             if moves > limit or trees.nodes[row] == trees.box.shape[1]:
                 continue
-            region = lowest(flood(bit(square), ~wall & ~after))
+            region = region_of(wall, after, square)
             slot = _find(trees, row, after, region)
             seen = trees.table[row, slot]
             if seen >= 0 and trees.moves[row, seen] <= moves:
@@ -273,7 +279,7 @@ def judge(
                 after = pushed(box, square, direction)
                 child = _DEAD
                 if not hopeless(after, wall, target, trees.dead[row]):
-                    region = lowest(flood(bit(square), ~wall & ~after))
+                    region = region_of(wall, after, square)
                     child = np.int64(trees.table[row, _find(trees, row, after, region)])
                 source[edges], direction_of[edges] = x, direction
                 square_of[edges], child_of[edges] = square, child

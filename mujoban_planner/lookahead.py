@@ -1,5 +1,9 @@
 """A planner that looks ahead: tree search guided by a learned planner, which it falls back on.
 
+Where no time passes it searches at once. On a robot it searches while the robot walks and waits: so many evaluations in
+every tick, so that an instruction is always there in time. A search is about the boxes and where the robot can walk to,
+so that it goes on while the robot walks; before a push, which cannot be taken back, the robot waits for its end.
+
 Off by default everywhere; its results are reported on their own line.
 
 Shapes: M robots, N = `grid.GRID_SIZE`, T moves.
@@ -7,82 +11,205 @@ Shapes: M robots, N = `grid.GRID_SIZE`, T moves.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
+from numba import njit
 from numpy.typing import NDArray
 
-from mujoban_core.interfaces import Memory, Planner, put_rows, take_rows
+from mujoban_core.grid import BOX, TARGET, WALL, Instruction
+from mujoban_core.interfaces import Memory, Module, Planner, put_rows, take_rows
 from mujoban_planner.abstract_env import MOVE_LIMIT, AbstractEnvironment
-from mujoban_planner.boards import likeliest_boards, state_tensor
+from mujoban_planner.boards import BitBoards, likeliest_boards, state_tensor
 from mujoban_planner.decision import PushMeans, VisitCounts, count_visits, recall, remember, state_keys
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state, split_memory
-from mujoban_planner.search import search
+from mujoban_planner.search import LoneSearch, advance
+from mujoban_planner.teacher import possible_pushes
+from mujoban_sokoban.bitboard import NONE, SQUARE_STEP, Bits, Int, bit, pushed
 
-_RETRY: Final = 6
-"""Decisions by the policy alone after a search that found nothing."""
+PER_TICK: Final = 2
+"""Evaluations in a tick by default: 8 ms of the 50 ms between two ticks."""
+CERTAINTY: Final = 0.9
+"""Probability by default with which all must be as it seems that a plan rests on."""
+MOST_EVALUATIONS: Final = 10_000
+"""Evaluations of a search at most."""
 _NO_KEY: Final = -1
+_OWN: Final = 6
+"""Arrays of the memory before those of the planner alone."""
 
 
 class LookAheadPlanner(Planner):
     """Searches when it has no plan for the state that it finds, follows the plan while the world does.
 
-    Where the search finds nothing in time, or a planned move keeps failing, the learned planner decides alone.
+    A plan is thrown away when the boxes or the robot are not where it expects them, when a wall appears on its way,
+    when the targets change, or when a planned move keeps failing. Where the search finds nothing, or what it found
+    rests on what is not known well enough, the learned planner decides alone.
     """
 
-    def __init__(self, planner: LearnedPlanner, expansions: int = 400) -> None:
-        """Look ahead by at most `expansions` evaluations of `planner` per search."""
+    def __init__(
+        self,
+        planner: LearnedPlanner,
+        expansions: int = 400,
+        *,
+        per_tick: int | None = None,
+        certainty: float = CERTAINTY,
+    ) -> None:
+        """Look ahead by at most `expansions` evaluations of `planner` per search.
+
+        Args:
+            planner: Guide, and what decides where there is no plan.
+            expansions: Evaluations of a search.
+            per_tick: Evaluations in a tick; None for as many as a search takes, before the next decision.
+            certainty: Probability with which all must be as it seems that a plan rests on.
+
+        Raises:
+            ValueError: If a number is out of its range.
+        """
         super().__init__()
-        self.planner = planner
-        self.expansions = expansions
+        in_range = 1 <= expansions <= MOST_EVALUATIONS and (per_tick is None or per_tick >= 1)
+        if not in_range or not 0.0 <= certainty <= 1.0:
+            raise ValueError(
+                f"look-ahead of {expansions} evaluations, {per_tick} in a tick, certainty {certainty}: expected 1 to "
+                f"{MOST_EVALUATIONS}, 1 at least, and a probability"
+            )
+        self.planner, self.expansions, self.per_tick, self.certainty = planner, expansions, per_tick, certainty
+        self.thinks = per_tick is not None
         self.evaluations = 0
         """Network evaluations by searches so far."""
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return (plan, its cursor, the state that it continues from, decisions to wait, planner's memory...)."""
+        """Return the memory at the start of `batch` episodes.
+
+        It holds the plan, its cursor, the state that it continues from, the squares that must be free for it and the
+        targets that it leads to, the search (None or a `LoneSearch`, which goes on), and the planner's memory.
+        """
         plan = np.zeros((batch, MOVE_LIMIT + 1), np.int64)
-        counters = np.zeros(batch, np.int64), np.full(batch, _NO_KEY, np.int64), np.zeros(batch, np.int64)
-        return (plan, *counters, *self.planner.initial_memory(batch))
+        expected = np.zeros(batch, np.int64), np.full(batch, _NO_KEY, np.int64)
+        grounds = np.zeros(batch, np.uint64), np.zeros(batch, np.uint64)
+        return (plan, *expected, *grounds, np.full(batch, None, object), *self.planner.initial_memory(batch))
+
+    def think(self, abstract_state: NDArray[np.float32], memory: Memory) -> Memory:
+        """Go on with the searches."""
+        del abstract_state  # what they are about is seen at the next decision
+        self._advance(memory[_OWN - 1])
+        return memory
 
     def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
         """Return an instruction for each state, [M] from [M, N, N, 4], and the next memory; errors as the planner's."""
         check_abstract_state(abstract_state)
-        plan, cursor, expected, wait = (np.array(x) for x in memory[:4])
-        visits, means = split_memory(memory[4:])
-        key = state_keys(abstract_state)
-        lost = (key != expected) | (plan[np.arange(len(plan)), cursor] == 0)
-        wait = np.maximum(wait - 1, 0)
-        rows = np.flatnonzero(lost & (wait == 0))
-        plan[lost], cursor[lost] = 0, 0
-        if rows.size:
-            self._search(abstract_state[rows], rows, plan, wait)
-        planned = plan[np.arange(len(plan)), cursor]
+        plan, cursor, expected, ground, target, searches = (np.array(x) for x in memory[:_OWN])
+        visits, means = split_memory(memory[_OWN:])
+        boards, every = likeliest_boards(abstract_state), np.arange(len(plan))
+        holds = (state_keys(abstract_state) == expected) & (plan[every, cursor] != 0)
+        holds &= (boards.target == target) & (boards.wall & ground == NONE)
+        plan[~holds], cursor[~holds] = 0, 0
+        lost = np.flatnonzero(~holds)
+        self._search(boards, lost, searches)
+        for row in lost.tolist():
+            self._adopt(abstract_state[row], boards, row, searches[row], plan, ground)
+        target = np.where(holds, target, boards.target)
+        planned = plan[every, cursor]
         counts = count_visits(abstract_state, visits)
-        stuck = counts.since_arrival[np.arange(len(plan)), planned] >= 2
+        stuck = counts.since_arrival[every, planned] >= 2
         alone = (planned == 0) | stuck
         decision = planned.copy()
         if alone.any():
             rows = np.flatnonzero(alone)
-            before = recall(abstract_state[rows], PushMeans(*take_rows(means, rows)))
-            chosen, after = self.planner.choose(abstract_state[rows], VisitCounts(*take_rows(counts, rows)), before)
-            means = put_rows(means, rows, after)
-            decision[alone] = chosen
+            chosen, means = self._choose(abstract_state, rows, counts, means)
+            decision[rows] = self._wait(chosen, rows, boards, searches, counts)
             plan[alone] = 0
         visits = remember(abstract_state, decision, visits)
         cursor = np.where(alone, 0, cursor + 1)
         expected = np.where(alone, _NO_KEY, _next_keys(abstract_state, decision))
-        return decision, (plan, cursor, expected, wait, *visits, *means)
+        return decision, (plan, cursor, expected, ground, target, searches, *visits, *means)
 
-    def _search(
-        self, states: NDArray[np.float32], rows: NDArray[np.int64], plan: NDArray[np.int64], wait: NDArray[np.int64]
+    def _advance(self, searches: NDArray[Any]) -> None:
+        steps = self.expansions if self.per_tick is None else self.per_tick
+        self.evaluations += advance([search for search in searches if search is not None], self.planner, steps)
+
+    def _search(self, boards: BitBoards, rows: NDArray[np.int64], searches: NDArray[Any]) -> None:
+        """Start searches for the states in `rows`, but where there is one, and go on with them."""
+        for row in rows.tolist():
+            here = BitBoards._make(column[row : row + 1] for column in boards)
+            search: Any = searches[row]
+            if search is None or not search.concerns(here):
+                searches[row] = LoneSearch(here, self.expansions, MOVE_LIMIT)
+        self._advance(searches[rows])
+
+    def _adopt(
+        self,
+        state: NDArray[np.float32],
+        boards: BitBoards,
+        row: int,
+        search: LoneSearch,
+        plan: NDArray[np.int64],
+        ground: NDArray[np.uint64],
     ) -> None:
-        """Write the plans found for `states` into `plan` at `rows`, and when to try again into `wait`."""
-        found = search(self.planner, likeliest_boards(states), expansions=self.expansions, limit=MOVE_LIMIT)
-        self.evaluations += int(found.expansions.sum())
-        for row, instructions in zip(rows, found.instructions, strict=True):
-            plan[row, : len(instructions)] = instructions
-            wait[row] = 0 if len(instructions) else _RETRY
+        """Write a plan that was found for a state, [N, N, 4], into `plan` and `ground`, if it is certain enough."""
+        instructions = search.solution(int(boards.agent[row]))
+        if not 0 < len(instructions) <= MOVE_LIMIT:
+            return
+        needed = _squares_used(boards.box[row], int(boards.agent[row]), instructions)
+        inner = state[1:-1, 1:-1].reshape(-1, state.shape[-1])
+        used, target, box = (
+            np.unpackbits(np.array([squares], "<u8").view(np.uint8), bitorder="little").astype(np.bool_)
+            for squares in (needed, boards.target[row], boards.box[row])
+        )
+        doubt = 1.0 - self.certainty
+        known = (inner[used, WALL] <= doubt).all() and (inner[target, TARGET] >= self.certainty).all()
+        if known and (inner[box, BOX] >= self.certainty).all():
+            plan[row, : len(instructions)], ground[row] = instructions, needed
+
+    def _choose(
+        self, states: NDArray[np.float32], rows: NDArray[np.int64], counts: VisitCounts, means: PushMeans
+    ) -> tuple[NDArray[np.int64], PushMeans]:
+        """Return what the planner alone decides in the states `rows`, and its means."""
+        before = recall(states[rows], PushMeans(*take_rows(means, rows)))
+        chosen, after = self.planner.choose(states[rows], VisitCounts(*take_rows(counts, rows)), before)
+        return chosen, PushMeans(*put_rows(means, rows, after))
+
+    def _wait(
+        self,
+        chosen: NDArray[np.int64],
+        rows: NDArray[np.int64],
+        boards: BitBoards,
+        searches: NDArray[Any],
+        counts: VisitCounts,
+    ) -> NDArray[np.int64]:
+        """Return STAY in place of pushes while a search may find better; not for ever where estimates flicker."""
+        if self.per_tick is None:
+            return chosen
+        searching = np.array([search is not None and search.open for search in searches[rows]])
+        pushing = possible_pushes(BitBoards._make(column[rows] for column in boards)) >> chosen & 1 == 1
+        patient = counts.since_arrival[rows, Instruction.STAY] < -(-self.expansions // self.per_tick)
+        return np.where(searching & pushing & patient, int(Instruction.STAY), chosen)
+
+
+def look_ahead(module: Module, expansions: int) -> Module:
+    """Return a planner that looks ahead while the robot walks; itself for 0.
+
+    Raises:
+        ValueError: If the number is negative, or the module is no learned planner.
+    """
+    if expansions == 0:
+        return module
+    if not isinstance(module, LearnedPlanner):
+        raise ValueError(f"look-ahead with a {type(module).__name__}: expected the learned planner, which guides it")
+    return LookAheadPlanner(module, expansions, per_tick=PER_TICK)
+
+
+@njit(cache=True, nogil=True)
+def _squares_used(box: Bits, agent: Int, instructions: NDArray[np.int64]) -> Bits:
+    """Return the squares that robot and boxes come to on the way of instructions, those where they are included."""
+    used = box | bit(agent)
+    for i in range(len(instructions)):
+        direction = np.int64(instructions[i]) - 1
+        agent += np.int64(SQUARE_STEP[direction])
+        if box & bit(agent) != NONE:
+            box = pushed(box, agent, direction)
+        used |= box | bit(agent)
+    return used
 
 
 def _next_keys(abstract_state: NDArray[np.float32], decision: NDArray[np.int64]) -> NDArray[np.int64]:

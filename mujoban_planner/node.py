@@ -11,12 +11,19 @@ from mujoban_msgs.msg import Episode
 from mujoban_core.interfaces import GroundTruth
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.runtime.descriptors import described
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
+from mujoban_planner.lookahead import MOST_EVALUATIONS, look_ahead
 
 
 class PlannerNode(ModuleNode):
-    """Publishes `/instruction` in every tick; parameters as in `ModuleNode`."""
+    """Publishes `/instruction` in every tick.
+
+    Parameters, beside those of `ModuleNode`:
+        look_ahead: Network evaluations of a tree search that looks for a way to the end of the level, spread over the
+            ticks; 0 for none. Fixed when the node starts.
+    """
 
     role = "planner"
     inputs = (
@@ -28,8 +35,17 @@ class PlannerNode(ModuleNode):
 
     def __init__(self, **options: Any) -> None:
         """Load the module and start listening."""
+        self._look_ahead: int | None = None
         super().__init__(**options)
         self._publisher = self.create_output(topics.INSTRUCTION)
+
+    def prepare(self, module: Any) -> Any:
+        """Let the planner look ahead, if it is to."""
+        if self._look_ahead is None:
+            about = described("evaluations of a search ahead; 0: none", fixed=True, low=0, high=MOST_EVALUATIONS)
+            value: Any = self.declare_parameter("look_ahead", 0, about).value
+            self._look_ahead = value
+        return look_ahead(module, self._look_ahead or 0)
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
         """Start the state; a planner that joins an episode goes on with the numbers of its predecessor."""

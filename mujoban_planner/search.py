@@ -9,7 +9,8 @@ Boards are those of `mujoban_sokoban.bitboard`. Shapes: M levels, I = 8, T moves
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -19,9 +20,12 @@ from torch.nn import functional
 from mujoban_core.grid import Instruction
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.forest import Forest
+from mujoban_planner.forest_kernels import region_of
 from mujoban_planner.heads import verdicts
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_sokoban.solver_labels import moves_of
+
+_FIRST: Final = np.zeros(1, np.int64)
 
 
 class Found(NamedTuple):
@@ -68,6 +72,57 @@ def _evaluate(planner: LearnedPlanner, boards: BitBoards) -> tuple[NDArray[np.fl
     alive = functional.logsigmoid(-output.dead[:, Instruction.STAY])
     push = output.push + verdicts(output)
     return push.flatten(2).float().cpu().numpy(), alive.float().cpu().numpy()
+
+
+class LoneSearch:
+    """A search in one level that takes a few steps at a time, together with others (`advance`)."""
+
+    def __init__(self, start: BitBoards, expansions: int, limit: int) -> None:
+        """Start from one state, with at most `expansions` evaluations and solutions of at most `limit` moves."""
+        self.start, self.expansions = start, expansions
+        self.forest = Forest(1, expansions, limit)
+        self.forest.plant(_FIRST, start)
+
+    @property
+    def spent(self) -> int:
+        """Evaluations so far."""
+        return int(self.forest.expansions[0])
+
+    @property
+    def open(self) -> bool:
+        """Whether it may still find a solution."""
+        return bool(self.forest.open[0]) and self.spent < self.expansions
+
+    def concerns(self, boards: BitBoards) -> bool:
+        """Return whether a state is that of the start but for the robot's place where it can walk."""
+        start = self.start
+        alike = all((x == y).all() for x, y in zip(start[:3], boards[:3], strict=True))
+        return alike and _region(start) == _region(boards)
+
+    def solution(self, agent: int) -> NDArray[np.int64]:
+        """Return the instructions that solve the level from where the robot is, [T]; none where none were found."""
+        return _instructions(self.forest, self.start._replace(agent=np.array([agent], np.uint8)), 0)
+
+
+def advance(searches: Sequence[LoneSearch], planner: LearnedPlanner, steps: int) -> int:
+    """Let searches take so many steps, as far as they are open; return the evaluations that this took."""
+    total = 0
+    for _ in range(steps):
+        active = [search.forest for search in searches if search.open]
+        if not active:
+            break
+        popped = [forest.pop(_FIRST) for forest in active]
+        columns = zip(*(boards for _, boards in popped), strict=True)
+        push, alive = _evaluate(planner, BitBoards._make(np.concatenate(column) for column in columns))
+        for i, (forest, (nodes, _)) in enumerate(zip(active, popped, strict=True)):
+            forest.expand(_FIRST, nodes, push[i : i + 1], alive[i : i + 1])
+        total += len(active)
+    return total
+
+
+def _region(boards: BitBoards) -> int:
+    """Return the lowest square that the robot of a state can walk to."""
+    return int(region_of(boards.wall[0], boards.box[0], int(boards.agent[0])))
 
 
 def _instructions(forest: Forest, starts: BitBoards, row: int) -> NDArray[np.int64]:

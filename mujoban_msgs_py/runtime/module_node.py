@@ -99,7 +99,11 @@ class ModuleNode(TickNode):
 
     def _load(self, weights: str, device: str) -> Any:
         module = load_module(self.role, self._source, Path(weights) if weights else None, device)
-        return look_around(module, self._look_around)
+        return look_around(self.prepare(module), self._look_around)
+
+    def prepare(self, module: Any) -> Any:
+        """Return the module that was loaded as this node wants it; a ValueError refuses it."""
+        return module
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         changed = {p.name: p.value for p in parameters}
