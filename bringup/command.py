@@ -277,9 +277,10 @@ def stack_from(arguments: argparse.Namespace) -> Stack:
     for role in filter(None, arguments.oracle.split(",")):
         if role not in ROLES:
             raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
-<<<<<<< HEAD
         choices[role] = _oracle(role, arguments.body)
-    return Stack(choices, arguments.device, arguments.look_around, arguments.threads, arguments.body)
+    return Stack(
+        choices, arguments.device, arguments.look_around, arguments.look_ahead, arguments.threads, arguments.body
+    )
 
 
 def _oracle(role: str, body: str) -> Choice:
@@ -289,9 +290,6 @@ def _oracle(role: str, body: str) -> Choice:
 
         return Choice(role, LEARNED, teacher_weights(body))
     return Choice(role, ORACLE)
-=======
-        choices[role] = Choice(role, ORACLE)
-    return Stack(choices, arguments.device, arguments.look_around, arguments.look_ahead)
 
 
 def import_from_here(path: Sequence[str] = ("",)) -> None:

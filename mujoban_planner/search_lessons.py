@@ -12,7 +12,7 @@ Shapes: M trees, R rows, S samples.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -57,9 +57,13 @@ class SearchConfig:
     """Steps of every search that are delivered at once."""
     walks: float = 0.25
     """Share that is kept of the states between two pushes."""
+    led: float = 0.5
+    """Share of searches that start from where the planner's own play leads; the others start from a level's start."""
+    lead: int = 16
+    """Pushes of such play at most."""
     verdicts: int = 6
     """States off the way, of each search, whose proven verdicts are kept."""
-    judged: float = 0.25
+    judged: float = 0.4
     """Share of a batch that holds such states."""
     buffer: int = 200_000
     """Samples kept of each kind."""
@@ -68,6 +72,16 @@ class SearchConfig:
     """Share of a batch whose abstract states are blurred, as estimates are."""
     hidden: float = 0.0
     """Share of a batch that shows only what the robot may have seen so far."""
+
+
+@dataclass
+class _Lead:
+    """The planner's own play before a search."""
+
+    pushes_left: int
+    """Pushes before the search begins."""
+    states: list[tuple[int, int, int]] = field(default_factory=list)
+    """Boxes, square of the robot, and push (4 * square + direction) so far."""
 
 
 class SearchActor(Actor):
@@ -90,6 +104,7 @@ class SearchActor(Actor):
         self._levels = TrainingLevels(stream, retried=config.retried, retries=config.retries)
         self._forest = Forest(config.trees, config.expansions << config.retries, MOVE_LIMIT)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
+        self._leads = [_Lead(0) for _ in range(config.trees)]
         self._rng = np.random.default_rng([stream, 4])
 
     def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
@@ -109,7 +124,9 @@ class SearchActor(Actor):
 
     def state(self) -> State:
         """Return levels, trees and random state."""
-        own = State({"rng": self._rng.bit_generator.state, "tickets": [list(ticket) for ticket in self._tickets]})
+        leads = [[lead.pushes_left, [list(state) for state in lead.states]] for lead in self._leads]
+        tickets = [list(ticket) for ticket in self._tickets]
+        own = State({"rng": self._rng.bit_generator.state, "tickets": tickets, "leads": leads})
         return State.of({"own": own, "levels": self._levels.state(), "forest": self._forest.state()})
 
     def restore(self, state: State) -> None:
@@ -119,26 +136,53 @@ class SearchActor(Actor):
         own = state.part("own").values
         self._rng.bit_generator.state = own["rng"]
         self._tickets = [Ticket(*ticket) for ticket in own["tickets"]]
+        self._leads = [_Lead(left, [(x, y, z) for x, y, z in states]) for left, states in own["leads"]]
 
     def _advance(self, lessons: dict[str, list[Samples]], ended: dict[str, list[bool]]) -> None:
         """Let every search take a step; learn from those that have ended, and start others in their place."""
         forest, config = self._forest, self.config
-        budget = np.array([config.expansions << ticket.failures for ticket in self._tickets])
-        over = np.flatnonzero(~forest.open | (forest.expansions >= budget))
+        over = np.flatnonzero(~forest.open | (forest.expansions >= self._budgets()))
         if over.size:
             planted = over[forest.trees.nodes[over] > 0]  # none is at first
             for row in planted.tolist():
                 ticket, solved = self._tickets[row], bool(forest.trees.solution[row] >= 0)
-                self._levels.report(ticket, solved)
-                if ticket.failures == 0:
-                    ended[f"search/{ticket.difficulty}"].append(solved)
+                if not self._leads[row].states:
+                    self._levels.report(ticket, solved)
+                    if ticket.failures == 0:
+                        ended[f"search/{ticket.difficulty}"].append(solved)
             self._learn(planted, lessons)
             boards, tickets = self._levels.draw(len(over))
             forest.plant(over, boards)
-            for row, ticket in zip(over.tolist(), tickets, strict=True):
-                self._tickets[row] = ticket
+            led = (self._rng.random(len(over)) < config.led) * self._rng.integers(1, config.lead + 1, len(over))
+            for row, ticket, pushes in zip(over.tolist(), tickets, led.tolist(), strict=True):
+                self._tickets[row], self._leads[row] = ticket, _Lead(0 if ticket.failures else pushes)
         with torch.autocast("cpu", torch.bfloat16):
             grow(forest, np.arange(config.trees), self.planner)
+        for row, lead in enumerate(self._leads):
+            if lead.pushes_left:
+                self._play(row, lead)
+
+    def _budgets(self) -> NDArray[np.int64]:
+        """Return the expansions that each search may take, [M]; those after own play have most to prove."""
+        config = self.config
+        doublings = [
+            config.retries if lead.states else ticket.failures
+            for ticket, lead in zip(self._tickets, self._leads, strict=True)
+        ]
+        return config.expansions << np.array(doublings, np.int64)
+
+    def _play(self, row: int, lead: _Lead) -> None:
+        """Push once by chance, as the planner's probabilities are, in a tree whose first node was just expanded."""
+        trees = self._forest.trees
+        children = np.arange(1, trees.nodes[row])
+        if trees.solution[row] >= 0 or not children.size:
+            lead.pushes_left = 0
+            return
+        chances = np.exp(trees.logp[row, children].astype(np.float64))
+        child = int(self._rng.choice(children, p=chances / chances.sum()))
+        lead.states.append((int(trees.box[row, 0]), int(trees.agent[row, 0]), int(trees.push[row, child])))
+        lead.pushes_left -= 1
+        self._forest.plant(np.array([row]), self._forest.boards(row, np.array([child])))
 
     def _learn(self, rows: NDArray[np.int64], lessons: dict[str, list[Samples]]) -> None:
         """Add what the searches in trees `rows`, [R], found and proved."""
@@ -152,6 +196,9 @@ class SearchActor(Actor):
         searched = [row for row in verdicts if forest.expansions[row] > _LONG]
         judged = [label_verdicts(forest, row, verdicts[row], config.verdicts, self._rng) for row in searched]
         lessons["verdict"] += judged
+        for row, proved in verdicts.items():
+            if self._leads[row].states and (proved.lost[0] or forest.trees.solution[row] >= 0):
+                lessons["verdict"].append(_label_lead(forest, row, self._leads[row], lost=bool(proved.lost[0])))
 
 
 class LessonStore:
@@ -227,3 +274,17 @@ def label_verdicts(
     judged = judged._replace(push_known=verdicts.known[chosen], push_dead=verdicts.dead[chosen])
     lost = np.flatnonzero(verdicts.lost & (rng.random(len(verdicts.node)) < DEAD_SHARE))
     return concatenate([judged, label_dead(forest.boards(row, verdicts.node[lost]))])
+
+
+def _label_lead(forest: Forest, row: int, lead: _Lead, *, lost: bool) -> Samples:
+    """Return what the end of a search says of the pushes before it: of a lost state the last, else all are judged."""
+    states = lead.states[-1:] if lost else lead.states
+    n = len(states)
+    box, agent = np.array([x for x, _, _ in states], np.uint64), np.array([x for _, x, _ in states], np.uint8)
+    wall, target = (np.full(n, column[row]) for column in (forest.trees.wall, forest.trees.target))
+    samples = unlabelled(BitBoards(wall, target, box, agent))
+    push = np.array([x for _, _, x in states])
+    samples.push_known[np.arange(n), push % 4] = np.uint64(1) << (push // 4).astype(np.uint64)
+    if lost:
+        samples.push_dead[:] = samples.push_known
+    return samples

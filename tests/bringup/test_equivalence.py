@@ -60,6 +60,11 @@ def test_an_ant_does_the_same_in_the_graph_as_in_process(play_graph, oracles, an
     assert_equal_runs(play_graph, stack, Episodes(1, 3, difficulty=1), 30)
 
 
+def test_a_planner_that_looks_ahead_while_the_robot_moves_does_the_same(play_graph, oracles):
+    stack = Stack(oracles.choices | {"planner": Choice("planner")}, look_ahead=30)
+    assert_equal_runs(play_graph, stack, Episodes(1, 7, difficulty=1), 60)
+
+
 def test_two_runs_of_the_graph_are_equal(play_graph, fresh_weights):
     runs = []
     for _ in range(2):
