@@ -18,7 +18,7 @@ from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.children import end_with_parent
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
-from mujoban_core.plugins import LEARNED, ORACLE, ROLES, load_module, shipped_weights
+from mujoban_core.plugins import LEARNED, ORACLE, PRIVILEGED, ROLES, load_module, shipped_weights
 from mujoban_core.signals import interrupt_status, interruptible, interruption, leave
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 
@@ -97,13 +97,17 @@ class Choice:
     def identity(self) -> str:
         """Return the SHA-256 digest of the weights in use, or what stands in for a learned module.
 
+        A class of the user's own that receives the ground truth, as oracles do, is named so.
+
         Raises:
             WeightsError: If the weights are missing.
         """
         from mujoban_rl.weights import WeightsError, digest
 
-        if self.source != LEARNED:
+        if self.source == ORACLE:
             return self.source
+        if self.source != LEARNED:
+            return f"{self.source}{PRIVILEGED}" if self.load().privileged else self.source
         path = self.weights or shipped_weights(self.role)
         if not path.is_file():
             raise WeightsError(f"no weights of the {self.role} at {path}: expected a .safetensors file")

@@ -71,7 +71,7 @@ class RecorderNode(Node):
             stamp = message.stamp
             if stamp > self.written:
                 self._ticks.setdefault(stamp, {}).setdefault(name, message.raw)
-                if name == topics.EPISODE.name and (message.content.terminated or message.content.truncated):
+                if name == topics.EPISODE.name and message.content.ended:
                     self._last_ticks.add(stamp)
                 self._write_if_complete(stamp)
             elif name == topics.EPISODE.name:

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from mujoban_msgs.msg import AbstractState, Episode, Instruction, Termination
+from mujoban_msgs.msg import AbstractState, EpisodeTruth, Instruction, Termination
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -99,7 +99,7 @@ class LiveNode(Node):
         self._torque = _Received(-1, 0.0)
         self._sequence = -1
         handlers: dict[Topic, Callable[[int, Any], None]] = {
-            topics.EPISODE: self._on_episode,
+            topics.TRUE_EPISODE: self._on_episode,
             topics.CAMERA: partial(self._on_image, "camera/first_person"),
             topics.TRUE_ABSTRACT_STATE: partial(self._on_grid, "grid/ground_truth"),
             topics.TOP_CAMERA: partial(self._on_image, "camera/top_down"),
@@ -166,7 +166,7 @@ class LiveNode(Node):
     def _log_milliseconds(self, what: str, start: _Received, end: _Received) -> None:
         self._stream.log(f"milliseconds/{what}", rr.Scalars(1000 * (end.at - start.at)))
 
-    def _on_episode(self, stamp: int, message: Episode) -> None:
+    def _on_episode(self, stamp: int, message: EpisodeTruth) -> None:
         self._stream.log("reward/step", rr.Scalars(message.reward))
         self._stream.log("reward/return", rr.Scalars(message.episode_return))
 

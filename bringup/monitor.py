@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from mujoban_msgs.msg import Episode
+from mujoban_msgs.msg import EpisodeTruth
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.task import Future
@@ -66,7 +66,7 @@ class MonitorNode(Node):
     def __init__(self, episodes: int, **options: Any) -> None:
         """Watch until so many episodes have ended."""
         super().__init__("monitor", **options)
-        self.episode: Episode | None = None
+        self.episode: EpisodeTruth | None = None
         self.latest: Watched | None = None
         self.results: list[EpisodeResult] = []
         self.finished = Future()
@@ -78,9 +78,9 @@ class MonitorNode(Node):
         self._log = EpisodeLog(0)
         self._sequence = 0
         self._joined = -1
-        self._end: Episode | None = None
+        self._end: EpisodeTruth | None = None
         qos = live_qos(depth=1024)
-        listen(self, topics.EPISODE, self._on_episode, qos=qos, decode=checked(topics.EPISODE))
+        listen(self, topics.TRUE_EPISODE, self._on_episode, qos=qos, decode=checked(topics.TRUE_EPISODE))
         for topic in _WATCHED:
             listen(self, topic, partial(self._receive, topic.name), qos=qos)
         self.watch = PublisherWatch(self)
@@ -105,7 +105,7 @@ class MonitorNode(Node):
             self._on_tick(Watched(joined))
 
     def _on_episode(self, received: Received) -> None:
-        message: Episode = received.content
+        message: EpisodeTruth = received.content
         if self._end is not None and message.episode == self._end.episode:
             # The episode goes on, so that its end was not the simulator's word.
             if message.header.stamp != self._end.header.stamp:

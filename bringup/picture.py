@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.interfaces import Observation
+from mujoban_core.interfaces import Observation, module_seeds
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -63,7 +63,7 @@ def draw_picture(config: Picture) -> Image.Image:
     world = World(1, world=config.world, max_boxes=len(level.boxes))
     world.reset([0], [EpisodeSpec(level, config.seed)])
     policy = SensePlanAct(OracleEstimator(), OracleTermination(), OraclePlanner(), OracleController())
-    state = policy.initial_state(np.array([config.seed]))
+    state = policy.initial_state(module_seeds(0, np.array([1])))
     unseen = np.zeros((1, FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
     views = []
     for step in range(1, config.steps + 1):

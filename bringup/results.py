@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mujoban_core.files import write_atomically
+from mujoban_core.plugins import is_privileged
 from mujoban_core.stats import wilson_interval
 
 
@@ -73,6 +74,7 @@ def report(results: Sequence[EpisodeResult], weights: Mapping[str, str], **extra
         "failures": dict(failures.most_common()),
         **extra,
         "weights": dict(weights),
+        "privileged": [role for role, identity in weights.items() if is_privileged(identity)],
         "episodes": [r.to_json() for r in results],
     }
 

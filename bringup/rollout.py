@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
-from mujoban_core.interfaces import GroundTruth, Observation, renew_rows
+from mujoban_core.interfaces import GroundTruth, Observation, module_seeds, renew_rows
 from mujoban_core.sense_plan_act import Decision, SensePlanAct
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
@@ -60,9 +60,16 @@ def select(tree: Tree, rows: NDArray[np.int64]) -> Tree:
 
 
 def ticks(
-    policy: SensePlanAct, world: World, episodes: Sequence[EpisodeSpec], *, camera: bool | None = None
+    policy: SensePlanAct,
+    world: World,
+    episodes: Sequence[EpisodeSpec],
+    *,
+    camera: bool | None = None,
+    run_seed: int = 0,
 ) -> Iterator[Tick]:
     """Play every episode once and yield each tick; a row takes the next episode as soon as its own has ended.
+
+    The modules' random streams come from `run_seed` and the number of the episode, not from its level.
 
     Rows without a further episode leave the policy's batch, so that the last, long episodes cost no more
     than they must. Frames are rendered if a module looks at them, unless `camera` says otherwise.
@@ -75,7 +82,7 @@ def ticks(
     rows = np.arange(min(world.batch, len(episodes)))
     episode = rows.copy()
     step = np.zeros(len(rows), np.int64)
-    seeds = np.array([episodes[i].seed for i in episode.tolist()], np.int64)
+    seeds = module_seeds(run_seed, episode + 1)
     state = policy.initial_state(seeds)
     camera = needs_camera(policy) if camera is None else camera
     torque = np.zeros((world.batch, world.body.action_size), np.float32)
@@ -106,7 +113,7 @@ def ticks(
         renewed = ended & ~finished
         if renewed.any():
             world.reset(rows[renewed], [episodes[i] for i in episode[renewed].tolist()])
-            seeds[renewed] = [episodes[i].seed for i in episode[renewed].tolist()]
+            seeds[renewed] = module_seeds(run_seed, episode[renewed] + 1)
             state = renew_rows(state, policy.initial_state(seeds), renewed)
             step[renewed] = 0
         kept = np.flatnonzero(~finished)

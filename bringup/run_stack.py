@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         video=options.video,
         view=options.view,
     )
-    with nullcontext() if options.headless else on_terminal(console) as on_refresh:
+    with nullcontext() if options.headless else on_terminal(console, weights) as on_refresh:
         outcome = play(stack, episodes, play_options, on_refresh=on_refresh)
     content = report(
         outcome.results,
@@ -93,14 +93,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ticks_per_second=outcome.ticks_per_second,
         counts=dict(outcome.counts),
     )
-    _sum_up(console, outcome, content["success_interval"])
+    _sum_up(console, outcome, weights, content["success_interval"])
     if options.json is not None:
         write_report(content, options.json)
     return 0
 
 
-def _sum_up(console: Console, outcome: Outcome, interval: Sequence[float]) -> None:
+def _sum_up(console: Console, outcome: Outcome, weights: Mapping[str, str], interval: Sequence[float]) -> None:
     from bringup.view import summary
+    from mujoban_core.plugins import is_privileged
 
     console.print(summary(outcome.results))
     solved, total = sum(r.solved for r in outcome.results), len(outcome.results)
@@ -109,6 +110,9 @@ def _sum_up(console: Console, outcome: Outcome, interval: Sequence[float]) -> No
         f"solved {solved} of {total} ({100 * solved / total:.1f} %, 95 % interval {low:.1f} to {high:.1f} %), "
         f"{outcome.ticks_per_second:.0f} ticks/s"
     )
+    told = [f"{role}: {identity}" for role, identity in weights.items() if is_privileged(identity)]
+    if told:
+        console.print(f"privileged, told the ground truth: {', '.join(told)}")
     for event, count in sorted(outcome.counts.items()):
         console.print(f"{event}: {count}")
 

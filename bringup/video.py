@@ -100,7 +100,7 @@ class VideoNode(Node):
     def _on_seen(self, stamp: int, parts: dict[str, Any]) -> None:
         episode: conversions.EpisodeReading = parts[topics.EPISODE.name]
         pixels = side_by_side(parts[topics.CAMERA.name], parts[topics.TOP_CAMERA.name])
-        self._waiting[stamp] = _Picture(pixels, episode.step, episode.terminated or episode.truncated)
+        self._waiting[stamp] = _Picture(pixels, episode.step, episode.ended)
 
     def _on_said(self, stamp: int, parts: dict[str, Any]) -> None:
         instruction: conversions.InstructionReading = parts[topics.INSTRUCTION.name]

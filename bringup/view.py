@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import numpy as np
-from mujoban_msgs.msg import Episode
+from mujoban_msgs.msg import EpisodeTruth
 from numpy.typing import NDArray
 from rich.columns import Columns
 from rich.console import Console, Group, RenderableType
@@ -18,6 +18,7 @@ from rich.text import Text
 from bringup.monitor import MonitorNode, Watched
 from bringup.results import EpisodeResult
 from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, TARGET, WALL, Instruction
+from mujoban_core.plugins import is_privileged
 
 ARROWS = {
     Instruction.STAY: "●",
@@ -56,8 +57,20 @@ def _glyph(cell: NDArray[np.float32], agent: bool) -> tuple[str, str]:
     return ("· ", "red") if target else ("  ", "")
 
 
-def live_view(episode: Episode | None, tick: Watched | None, outcomes: Sequence[EpisodeResult]) -> RenderableType:
-    """Return what the terminal shows of the latest tick."""
+def live_view(
+    episode: EpisodeTruth | None,
+    tick: Watched | None,
+    outcomes: Sequence[EpisodeResult],
+    weights: Mapping[str, str] | None = None,
+) -> RenderableType:
+    """Return what the terminal shows of the latest tick; modules that are told the ground truth are named.
+
+    Args:
+        episode: The episode.
+        tick: What the modules said.
+        outcomes: Of the episodes before.
+        weights: Name of each module -> what identifies it, see `bringup.command.Stack.identities`.
+    """
     if episode is None or tick is None:
         return Text("waiting for the graph ...")
     said = tick.instruction
@@ -70,6 +83,7 @@ def live_view(episode: Episode | None, tick: Watched | None, outcomes: Sequence[
         ("on target", str(episode.boxes_on_target)),
         ("solved", f"{sum(r.solved for r in outcomes)} of {len(outcomes)}"),
         ("termination", f"p = {tick.termination.probability:.2f}"),
+        ("privileged", ", ".join(role for role, name in (weights or {}).items() if is_privileged(name)) or "none"),
     ):
         facts.add_row(Text(name, "bright_black"), value)
     arrow = Text(f"{ARROWS[Instruction(said.direction)]}  {Instruction(said.direction).name.lower()}", "bold green")
@@ -84,10 +98,14 @@ def live_view(episode: Episode | None, tick: Watched | None, outcomes: Sequence[
 
 
 @contextmanager
-def on_terminal(console: Console) -> Iterator[Callable[[MonitorNode, Sequence[EpisodeResult]], None]]:
+def on_terminal(
+    console: Console, weights: Mapping[str, str] | None = None
+) -> Iterator[Callable[[MonitorNode, Sequence[EpisodeResult]], None]]:
     """Return what shows the latest tick of a monitor on a terminal, in place of the one before."""
     with Live(console=console, auto_refresh=False) as live:
-        yield lambda monitor, results: live.update(live_view(monitor.episode, monitor.latest, results), refresh=True)
+        yield lambda monitor, results: live.update(
+            live_view(monitor.episode, monitor.latest, results, weights), refresh=True
+        )
 
 
 def summary(results: Sequence[EpisodeResult]) -> Table:

@@ -33,7 +33,7 @@ from mujoban_sim.goals import GoalKind, GoalTracker
 from mujoban_sim.oracles import cells_of_boxes
 
 TOPICS: Final = (
-    topics.EPISODE,
+    topics.TRUE_EPISODE,
     topics.CAMERA,
     topics.PROPRIO,
     topics.INSTRUCTION,

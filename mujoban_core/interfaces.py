@@ -122,6 +122,21 @@ def counter_uniform(seed: NDArray[np.int64], counter: NDArray[np.int64]) -> NDAr
     return (z >> np.uint64(11)).astype(np.float64) / float(1 << 53)
 
 
+_MODULE_STREAM = 0x4D4F44
+
+
+def module_seeds(run_seed: int, number: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the seeds of modules' random streams in episodes, [B]; they tell nothing of the levels.
+
+    Args:
+        run_seed: Of the run, at least 0.
+        number: Numbers of the episodes within the run, from 1, [B].
+    """
+    return np.array(
+        [np.random.SeedSequence([_MODULE_STREAM, run_seed, int(n)]).generate_state(1)[0] for n in number], np.int64
+    )
+
+
 class Module(ABC):
     """What the four modules have in common."""
 

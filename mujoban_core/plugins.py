@@ -19,6 +19,9 @@ from mujoban_core.interfaces import Controller, Estimator, Module, Planner, Term
 LEARNED: Final = "learned"
 ORACLE: Final = "oracle"
 
+PRIVILEGED: Final = " (privileged)"
+"""Ends the name of a class, other than an oracle, that receives the ground truth."""
+
 GROUP: Final = "mujoban.modules"
 """The entry points' group."""
 
@@ -58,6 +61,11 @@ def load_module(role: str, source: str = LEARNED, weights: Path | None = None, d
         expected = f"{interface.__module__}.{interface.__name__}"
         raise PluginError(f"{source} is a {type(module).__name__}: the {role} must be a {expected}")
     return module
+
+
+def is_privileged(identity: str) -> bool:
+    """Tell from what a report calls a module whether it is told the ground truth."""
+    return identity == ORACLE or identity.endswith(PRIVILEGED)
 
 
 def shipped_weights(role: str) -> Path:

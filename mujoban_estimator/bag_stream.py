@@ -15,7 +15,7 @@ from mujoban_msgs_py.bags import Bag, BagError
 from mujoban_msgs_py.bags.training import ReadReport, episode_ticks, open_training_bag
 
 TOPICS: Final = (
-    topics.EPISODE,
+    topics.TRUE_EPISODE,
     topics.CAMERA,
     topics.POSE,
     topics.PROPRIO,

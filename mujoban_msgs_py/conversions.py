@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Quaternion, TwistStamped, Vector3
-from mujoban_msgs.msg import AbstractState, Episode, Instruction, Proprioception, Termination
+from mujoban_msgs.msg import AbstractState, Episode, EpisodeTruth, Instruction, Proprioception, Termination
 from numpy.typing import ArrayLike, NDArray
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
@@ -292,7 +292,25 @@ def boxes_from_msg(message: Any) -> NDArray[np.float32]:
 
 
 class EpisodeReading(NamedTuple):
-    """Start, progress and end of an episode; the fields are those of `mujoban_msgs/msg/Episode`."""
+    """Start, number and end of an episode; the fields are those of `mujoban_msgs/msg/Episode`."""
+
+    episode: int
+    step: int
+    ended: bool
+
+
+def episode_to_msg(header: Header, reading: EpisodeReading) -> Episode:
+    """Return what every node may know of an episode."""
+    return Episode(header=header, episode=int(reading.episode), step=int(reading.step), ended=bool(reading.ended))
+
+
+def episode_from_msg(message: Any) -> EpisodeReading:
+    """Return what every node may know of an episode."""
+    return EpisodeReading(message.episode, message.step, message.ended)
+
+
+class EpisodeTruthReading(NamedTuple):
+    """Level, reward and outcome of an episode; the fields are those of `mujoban_msgs/msg/EpisodeTruth`."""
 
     episode: int
     seed: int
@@ -307,10 +325,10 @@ class EpisodeReading(NamedTuple):
     boxes_on_target: int
 
 
-def episode_to_msg(header: Header, reading: EpisodeReading) -> Episode:
-    """Return the state of an episode."""
+def episode_truth_to_msg(header: Header, reading: EpisodeTruthReading) -> EpisodeTruth:
+    """Return the truth about an episode."""
     reward, total = _finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float64).tolist()
-    return Episode(
+    return EpisodeTruth(
         header=header,
         episode=int(reading.episode),
         seed=int(reading.seed),
@@ -326,9 +344,9 @@ def episode_to_msg(header: Header, reading: EpisodeReading) -> Episode:
     )
 
 
-def episode_from_msg(message: Any) -> EpisodeReading:
-    """Return the state of an episode."""
-    reading = EpisodeReading(*(getattr(message, name) for name in EpisodeReading._fields))
+def episode_truth_from_msg(message: Any) -> EpisodeTruthReading:
+    """Return the truth about an episode."""
+    reading = EpisodeTruthReading(*(getattr(message, name) for name in EpisodeTruthReading._fields))
     _finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float64)
     if reading.difficulty not in (0, *DIFFICULTIES):
         raise ConversionError(f"difficulty must be 0 or one of {sorted(DIFFICULTIES)}, got {reading.difficulty}")

@@ -36,6 +36,7 @@ DECODERS: Final[dict[Topic, Decode]] = {
     topics.TRUE_TWIST: conversions.twist_from_msg,
     topics.TRUE_BOXES: conversions.boxes_from_msg,
     topics.TRUE_TERMINATION: conversions.termination_from_msg,
+    topics.TRUE_EPISODE: conversions.episode_truth_from_msg,
     topics.TOP_CAMERA: _any_size,
     topics.RECORDED: conversions.stamp_of,
 }

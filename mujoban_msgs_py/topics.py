@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
 from geometry_msgs.msg import PoseArray, PoseStamped, TwistStamped
-from mujoban_msgs.msg import AbstractState, Episode, Instruction, Proprioception, Termination
+from mujoban_msgs.msg import AbstractState, Episode, EpisodeTruth, Instruction, Proprioception, Termination
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import Header
@@ -73,7 +73,7 @@ PROPRIO: Final = Topic("/proprio", Proprioception)
 POSE: Final = Topic("/pose", PoseStamped)
 """o_pos = (x, y, psi) in `MAP_FRAME`."""
 EPISODE: Final = Topic("/episode", Episode, latched=True)
-"""Start, reward, return and end of the episode."""
+"""Start, number and end of the episode: all that modules may know of it."""
 CLOCK: Final = Topic("/clock", Clock)
 """t."""
 ABSTRACT_STATE: Final = Topic("/abstract_state", AbstractState)
@@ -93,12 +93,14 @@ TRUE_BOXES: Final = Topic("/ground_truth/boxes", PoseArray)
 """o_box."""
 TRUE_TERMINATION: Final = Topic("/ground_truth/termination", Termination)
 """Whether A_{t-1} is completed by the rule of paper C.4."""
+TRUE_EPISODE: Final = Topic("/ground_truth/episode", EpisodeTruth, latched=True)
+"""Level, seed, reward, return and outcome of the episode."""
 TOP_CAMERA: Final = Topic("/camera_top/image_raw", Image)
 """o_top, rgb8."""
 RECORDED: Final = Topic("/recorded", Header)
 """The recorder has written the tick of this stamp."""
 
-TRUTH_TOPICS: Final = (TRUE_ABSTRACT_STATE, TRUE_POSE, TRUE_TWIST, TRUE_BOXES, TRUE_TERMINATION)
+TRUTH_TOPICS: Final = (TRUE_ABSTRACT_STATE, TRUE_POSE, TRUE_TWIST, TRUE_BOXES, TRUE_TERMINATION, TRUE_EPISODE)
 """What only oracles and recorders receive."""
 SIMULATOR_TOPICS: Final = (CLOCK, EPISODE, CAMERA, CAMERA_INFO, PROPRIO, POSE, *TRUTH_TOPICS, TOP_CAMERA)
 """What the simulator publishes."""

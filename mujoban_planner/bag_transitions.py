@@ -18,7 +18,7 @@ from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags.training import EpisodeTick, episode_ticks, find_bags, open_training_bag
 from mujoban_planner.abstract_env import STEP_REWARD
 
-_TOPICS = (topics.EPISODE, topics.TRUE_ABSTRACT_STATE, topics.INSTRUCTION, topics.TERMINATION)
+_TOPICS = (topics.TRUE_EPISODE, topics.TRUE_ABSTRACT_STATE, topics.INSTRUCTION, topics.TERMINATION)
 
 
 class BagTransitions(NamedTuple):

@@ -141,7 +141,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
 
     ## Arguments
     ``gymnasium.make("Mujoban-v0", difficulty=5, level_file=None, observations="default", body="ball",
-    world="eased", time_limit=None, render_mode=None)``. `import mujoban_sim` registers the environment.
+    world=DEFAULT_WORLD, time_limit=None, render_mode=None)``. `import mujoban_sim` registers the environment.
 
     ## Version history
     v0: first version.

@@ -35,7 +35,7 @@ class ObservationPublisher:
         self._top_camera_size = top_camera_size
         self._composer = TickComposer(world.body)
         self._publishers = {t: node.create_publisher(t.type, t.name, t.qos) for t in topics.SIMULATOR_TOPICS}
-        self._on_demand = {*topics.TRUTH_TOPICS, topics.TOP_CAMERA, topics.CAMERA_INFO}
+        self._on_demand = {*topics.TRUTH_TOPICS, topics.TOP_CAMERA, topics.CAMERA_INFO} - {topics.TRUE_EPISODE}
         self._top_readers, self._top_period = 0, 1
 
     def matched(self, *, everything: bool) -> bool:

@@ -73,6 +73,7 @@ class TickComposer:
             topics.TRUE_TWIST: lambda tick: conversions.twist_to_msg(_map(tick), tick.truth.velocity[tick.row]),
             topics.TRUE_BOXES: self._boxes,
             topics.TRUE_TERMINATION: self._termination,
+            topics.TRUE_EPISODE: self._true_episode,
         }
         self.topics = tuple(self._composers)
         """In the order in which the simulator speaks."""
@@ -87,11 +88,16 @@ class TickComposer:
         return self._composers[topic](tick)
 
     def _episode(self, tick: SimulatorTick) -> Any:
+        progress = tick.progress
+        reading = conversions.EpisodeReading(tick.label.episode, progress.step, progress.solved or progress.truncated)
+        return conversions.episode_to_msg(_map(tick), reading)
+
+    def _true_episode(self, tick: SimulatorTick) -> Any:
         label, progress = tick.label, tick.progress
         if progress.spec is not self._spec:
             self._spec, self._level_text = progress.spec, progress.spec.level.to_text()
         state = tick.truth.abstract_state[tick.row]
-        reading = conversions.EpisodeReading(
+        reading = conversions.EpisodeTruthReading(
             episode=label.episode,
             seed=progress.spec.seed,
             difficulty=label.difficulty,
@@ -104,7 +110,7 @@ class TickComposer:
             truncated=progress.truncated,
             boxes_on_target=int((state[..., BOX] * state[..., TARGET]).sum()),
         )
-        return conversions.episode_to_msg(_map(tick), reading)
+        return conversions.episode_truth_to_msg(_map(tick), reading)
 
     def _camera(self, tick: SimulatorTick) -> Any:
         header = conversions.header(tick.label.stamp, topics.CAMERA_FRAME)

@@ -47,6 +47,8 @@ def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
     paper.append(MISSING if run.paper_reward is None else f"{run.paper_reward:.2f}")
     if report is None:
         return [run.title, name, oracles, "0", "not measured", MISSING, paper[0], MISSING, paper[1]]
+    # A class of somebody's own that is told the truth counts as what it is.
+    oracles = ", ".join(report.get("privileged", run.oracle)) or "none"
     returns = np.array([episode["return"] for episode in report["episodes"]])
     error = returns.std(ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else float("nan")
     low, high = report["success_interval"]

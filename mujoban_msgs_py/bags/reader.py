@@ -122,7 +122,7 @@ class Bag:
         Args:
             wanted: The topics.
             endings: Yield an episode's last tick as well, which no module answers: what modules say is None there.
-                `topics.EPISODE` must be wanted, since it tells which tick that is.
+                `topics.TRUE_EPISODE` must be wanted, since it tells which tick that is.
 
         Raises:
             BagError: As `read`.
@@ -137,7 +137,7 @@ class Bag:
             complete = join.add(message.topic, stamp, value)
             if complete is None and ending is not None and message.topic in unanswered:
                 last = ending.add(message.topic, stamp, value)
-                if last is not None and _is_over(last[topics.EPISODE.name]):
+                if last is not None and _is_over(last[topics.TRUE_EPISODE.name]):
                     complete = last
             if complete is not None:
                 yield Tick(stamp, tuple(complete.get(name) for name in names))
@@ -179,7 +179,7 @@ class Bag:
             raise BagError(f"no topic {', '.join(missing)} in bag {self.path}; its topics: {has}")
 
 
-def _is_over(episode: conversions.EpisodeReading) -> bool:
+def _is_over(episode: conversions.EpisodeTruthReading) -> bool:
     return episode.terminated or episode.truncated
 
 

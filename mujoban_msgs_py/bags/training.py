@@ -17,7 +17,7 @@ from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.metadata import FILE_NAME
 from mujoban_msgs_py.bags.reader import Bag, open_bag
-from mujoban_msgs_py.conversions import EpisodeReading
+from mujoban_msgs_py.conversions import EpisodeTruthReading
 from mujoban_msgs_py.topics import Topic
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
@@ -72,7 +72,7 @@ def require_training_seeds(bag: Bag) -> None:
     Raises:
         BagError: If it does, or is damaged.
     """
-    for value in bag.read([topics.EPISODE.name]):
+    for value in bag.read([topics.TRUE_EPISODE.name]):
         _require_training_seed(bag, value.value.seed)
         return
 
@@ -98,7 +98,7 @@ class ReadReport:
 class EpisodeTick(NamedTuple):
     """A tick of an episode all of whose earlier ticks came before."""
 
-    episode: EpisodeReading
+    episode: EpisodeTruthReading
     """Its `step` is 0 where an episode begins."""
     values: tuple[Any, ...]
     """In the order of the topics wanted."""
@@ -118,7 +118,7 @@ def episode_ticks(
 
     Args:
         bag: As `open_training_bag` returns it.
-        wanted: Topics, with `topics.EPISODE` among them.
+        wanted: Topics, with `topics.TRUE_EPISODE` among them.
         report: Counts what is read and left out.
         endings: Yield an episode's last tick as well, which no module answers: as `Bag.ticks`.
         allow_test_seeds: Yield episodes with seeds that are kept for tests instead of refusing the bag.
@@ -127,10 +127,10 @@ def episode_ticks(
         BagError: As `Bag.ticks`, or if an episode's seed is not for training.
     """
     report = ReadReport() if report is None else report
-    which = wanted.index(topics.EPISODE)
+    which = wanted.index(topics.TRUE_EPISODE)
     number, following = None, 0
     for tick in bag.ticks(wanted, endings=endings):
-        reading: EpisodeReading = tick.values[which]
+        reading: EpisodeTruthReading = tick.values[which]
         if not allow_test_seeds:
             _require_training_seed(bag, reading.seed)
         if reading.step == 0:

@@ -12,7 +12,7 @@ from mujoban_msgs.msg import Episode
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
-from mujoban_core.interfaces import GroundTruth
+from mujoban_core.interfaces import GroundTruth, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, look_around
 from mujoban_core.plugins import LEARNED, load_module
 from mujoban_core.threads import set_threads
@@ -43,6 +43,7 @@ class ModuleNode(TickNode):
         device: Device of the learned module; setting it loads the weights again.
         threads: Threads of PyTorch in this process; at batch 1 further ones gain little on an idle machine, and on a
             busy one they wait for each other. Fixed when the node starts.
+        run_seed: Seed of the module's random streams, one for each number of an episode; fixed when the node starts.
         look_around: Of planner and controller alone: ticks of a look, which is a turn on the spot; 0 for none. Fixed
             when the node starts.
     """
@@ -65,6 +66,9 @@ class ModuleNode(TickNode):
         self._source: str = source
         weights: Any = self.declare_parameter("weights", "", described("weights file; empty: those that ship")).value
         device: Any = self.declare_parameter("device", "cpu", described("cpu or cuda, such as cuda:0")).value
+        seeds = described("seed of the module's random streams", fixed=True, low=0, high=2**31 - 1)
+        run_seed: Any = self.declare_parameter("run_seed", 0, seeds).value
+        self._run_seed: int = run_seed
         self._look_around = 0
         if self.role in LOOKING_ROLES:
             look = described("ticks of a look, a turn on the spot; 0: none", fixed=True, low=0, high=MOST_TICKS)
@@ -83,11 +87,11 @@ class ModuleNode(TickNode):
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
         """Start `self.state` at the first tick that the module sees of an episode."""
-        self.state = self.module.initial_state(np.array([episode.seed], np.int64))
+        self.state = self.module.initial_state(module_seeds(self._run_seed, np.array([episode.episode])))
 
     def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
         """Step the module; an episode's last tick needs no answer."""
-        if episode.terminated or episode.truncated:
+        if episode.ended:
             return ()
         if self.state is None or episode.episode != self._episode:
             self._episode = episode.episode

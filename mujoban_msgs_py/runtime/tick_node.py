@@ -156,8 +156,7 @@ class TickNode(Node):
             self.retry()
 
     def _note_offer(self, stamp: int, episode: Episode) -> None:
-        ended = episode.terminated or episode.truncated
-        if stamp == self._handled and (self._outputs or ended):
+        if stamp == self._handled and (self._outputs or episode.ended):
             self._publish()
         elif stamp == self._handled:
             # It was answered as an end, with nothing: that end was not the simulator's word.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import pytest
-from mujoban_msgs.msg import Episode, Instruction
+from mujoban_msgs.msg import EpisodeTruth, Instruction
 from rclpy.node import Node
 
 from bringup.command import Choice, Stack
@@ -31,7 +31,7 @@ class Said:
     instruction: dict[int, tuple[int, int]] = field(default_factory=dict)
     torque: dict[int, list[float]] = field(default_factory=dict)
     reward: dict[int, float] = field(default_factory=dict)
-    episodes: dict[int, Episode] = field(default_factory=dict)
+    episodes: dict[int, EpisodeTruth] = field(default_factory=dict)
 
 
 class Tap(Node):
@@ -40,7 +40,7 @@ class Tap(Node):
     def __init__(self):
         super().__init__("tap")
         self.said = Said()
-        self.create_subscription(Episode, topics.EPISODE.name, self._episode, live_qos(1000))
+        self.create_subscription(EpisodeTruth, topics.TRUE_EPISODE.name, self._episode, live_qos(1000))
         self.create_subscription(Instruction, topics.INSTRUCTION.name, self._instruction, live_qos(1000))
         listen(self, topics.TORQUE, self._torque, qos=live_qos(1000))
 

@@ -67,16 +67,16 @@ def test_an_end_that_the_simulator_did_not_announce_is_taken_back_when_the_tick_
     state = conversions.abstract_state_to_msg(header, np.zeros((10, 10, 4), np.float32))
     planner = graph.graph.nodes["planner"]
 
-    def offer(*, terminated):
-        reading = conversions.EpisodeReading(1, 0, 5, "", 2, 0.0, 0.0, terminated, terminated, False, 0)
+    def offer(*, ended):
+        reading = conversions.EpisodeReading(1, 2, ended)
         mouths[topics.EPISODE].publish(conversions.episode_to_msg(header, reading))
         mouths[topics.ABSTRACT_STATE].publish(state)
         mouths[topics.TERMINATION].publish(conversions.termination_to_msg(header, 0, 0.0, False))
 
-    offer(terminated=True)
+    offer(ended=True)
     graph.spin_until(lambda: planner._handled == 3 * topics.TICK)
     assert not graph.said.instruction
-    offer(terminated=False)
+    offer(ended=False)
     graph.spin_until(lambda: graph.said.instruction)
     assert planner.counts["contradictory episodes"] == 1
 

@@ -47,7 +47,7 @@ def test_run_stack_plays_records_films_and_reports(tmp_path, capfd):
     assert content["success_rate"] == 1.0 and [e["seed"] for e in content["episodes"]] == [*TRAIN_SEEDS[:2]]
     assert {"success_interval", "mean_return", "weights", "ticks_per_second"} <= content.keys()
     assert "solved 2 of 2" in capfd.readouterr().out
-    recorded = list(episode_ticks(open_training_bag(bag, [topics.EPISODE]), [topics.EPISODE]))
+    recorded = list(episode_ticks(open_training_bag(bag, [topics.TRUE_EPISODE]), [topics.TRUE_EPISODE]))
     assert len(recorded) == sum(e["steps"] + 1 for e in content["episodes"]), "every tick may be learned from"
     film = imageio.get_reader(video).get_meta_data()
     assert film["codec"] == "h264" and film["pix_fmt"].startswith("yuv420p") and film["size"] == (768, 384)

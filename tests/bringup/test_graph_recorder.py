@@ -43,7 +43,7 @@ def test_a_lockstep_bag_lacks_nothing(bags):
         said = [stamp for topic, stamp, _ in messages if topic == name]
         ends = 3 if name in {t.name for t in MODULE_TOPICS} else 0
         assert len(said) == len(set(said)) == len(stamps) - ends, name
-    assert [len(SIMULATOR_TOPICS), len(MODULE_TOPICS)] == [12, 4]
+    assert [len(SIMULATOR_TOPICS), len(MODULE_TOPICS)] == [13, 4]
     assert len(bag.files) == 2, "one file for two episodes"
 
 
@@ -71,7 +71,7 @@ def test_the_graph_and_the_rollout_record_the_same_of_an_episode(oracles, tmp_pa
     graph, rollout = said(tmp_path / "graph"), said(tmp_path / "row000")
     for topic in graph:
         assert graph[topic] == rollout[topic], topic
-    last = [m for m in rollout[topics.EPISODE.name].values() if m.solved]
+    last = [m for m in rollout[topics.TRUE_EPISODE.name].values() if m.solved]
     assert last[0].boxes_on_target == 1 and last[0].reward > 10
 
 

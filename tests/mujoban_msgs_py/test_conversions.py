@@ -106,10 +106,13 @@ def test_camera_calibration_round_trips():
 
 
 def test_episodes_round_trip():
-    reading = c.EpisodeReading(3, -5, 4, "#####\n#@$.#", 17, 0.5, -1.25, True, True, False, 2)
+    reading = c.EpisodeTruthReading(3, -5, 4, "#####\n#@$.#", 17, 0.5, -1.25, True, True, False, 2)
     numpy_scalars = reading._replace(seed=np.int64(-5), reward=np.float32(0.5), solved=np.bool_(True))
-    for received in over_the_wire(c.episode_to_msg(HEADER, numpy_scalars)):
-        assert c.episode_from_msg(received) == reading
+    for received in over_the_wire(c.episode_truth_to_msg(HEADER, numpy_scalars)):
+        assert c.episode_truth_from_msg(received) == reading
+    public = c.EpisodeReading(3, 17, True)
+    for received in over_the_wire(c.episode_to_msg(HEADER, public)):
+        assert c.episode_from_msg(received) == public
 
 
 def image(**changes):

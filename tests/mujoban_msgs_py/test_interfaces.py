@@ -49,7 +49,7 @@ def test_latched_topics_reach_late_joiners_and_all_are_reliable():
     for topic in topics.GRAPH_TOPICS.values():
         assert topic.qos.reliability == ReliabilityPolicy.RELIABLE
     latched = {t.name for t in topics.GRAPH_TOPICS.values() if t.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL}
-    assert latched == {"/episode", "/instruction"}
+    assert latched == {"/episode", "/ground_truth/episode", "/instruction"}
 
 
 def test_reading_bags_and_converting_need_no_rclpy():

@@ -61,7 +61,7 @@ def talker():
     node.declare_parameter("name", "ball")
     pose = node.create_publisher(topics.POSE.type, topics.POSE.name, topics.POSE.qos)
     episode = node.create_publisher(topics.EPISODE.type, topics.EPISODE.name, topics.EPISODE.qos)
-    reading = conversions.EpisodeReading(7, 1, 5, "#@#", 0, 0.0, 0.0, False, False, False, 0)
+    reading = conversions.EpisodeReading(7, 0, False)
     episode.publish(conversions.episode_to_msg(conversions.header(5), reading))
     node.heard = []
     node.create_subscription(String, "/chatter", lambda m: node.heard.append(m.data), 10)
