@@ -162,12 +162,15 @@ class MPOLearner(ProductLearner[Batch]):
 
     def _normalise(self, batch: Mapping[str, Tensor]) -> None:
         """Take in what is seen, for online and target networks alike: what they compute would differ otherwise."""
-        features = batch["features"].flatten(0, 1)
-        for module in (self.critic, self.target_critic, self.policy, self.target_policy):
-            if not isinstance(module, VisuomotorController):
-                module.normaliser.update(features)
-            elif not module.fitted:
-                module.fit_normalisation(batch["proprio"].flatten(0, 1))
+        self.critic.normaliser.update(batch["features"][:, 0])
+        self.target_critic.normaliser.load_state_dict(self.critic.normaliser.state_dict())
+        policy, target = self.policy, self.target_policy
+        if isinstance(policy, PrivilegedPolicy) and isinstance(target, PrivilegedPolicy):
+            policy.normaliser.update(batch["features"][:, 0])
+            target.normaliser.load_state_dict(policy.normaliser.state_dict())
+        for camera in (policy, target):
+            if isinstance(camera, VisuomotorController) and not camera.fitted:
+                camera.fit_normalisation(batch["proprio"].flatten(0, 1))
 
     def _as_seen(self, action: Tensor, batch: Mapping[str, Tensor]) -> Tensor:
         """Return a policy's actions in the last W - n ticks as the side ahead sees them, [N, M, W - n, U]."""

@@ -108,7 +108,7 @@ class Value(nn.Module):
 class Critic(nn.Module):
     """Q of privileged features and actions as the side ahead sees them (the asymmetric critic of paper C.3)."""
 
-    def __init__(self, body: str = "ball", width: int = 256) -> None:
+    def __init__(self, body: str = "ball", width: int = 128) -> None:
         """Build the network for a body."""
         super().__init__()
         layout = feature_layout(get_body(body))
