@@ -17,7 +17,11 @@ from matplotlib import pyplot as plt
 
 @dataclass(frozen=True)
 class Options:
-    """Solve rate on held-out levels over samples and over time."""
+    """Solve rate on held-out levels over samples and over CPU time.
+
+    A sample is a labelled state (imitation), an instruction (MPO), a push (PPO and MPO over pushes) or a network
+    evaluation of a search (expert iteration).
+    """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Run directories."""
@@ -28,14 +32,14 @@ class Options:
 
 
 def read_curve(run: Path, difficulty: int) -> list[tuple[float, float, float]]:
-    """Return (step, seconds, solve rate) of each evaluation of a run.
+    """Return (samples, CPU seconds, solve rate) of each evaluation of a run.
 
     Raises:
         OSError: If the run has no metrics.
     """
     lines = (json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines())
     key = f"evaluation/solve_rate/{difficulty}"
-    return [(line["step"], line["seconds"], line[key]) for line in lines if key in line]
+    return [(line["step"], line["cpu_seconds"], line[key]) for line in lines if key in line]
 
 
 def main() -> None:
@@ -50,8 +54,8 @@ def main() -> None:
     for name, curve in curves.items():
         for axis, column, scale in ((axes[0], 0, 1e3), (axes[1], 1, 60.0)):
             axis.plot([point[column] / scale for point in curve], [point[2] for point in curve], ".-", label=name)
-    axes[0].set(xlabel="thousand samples (MPO: instructions)", ylabel=f"solve rate, difficulty {options.difficulty}")
-    axes[1].set(xlabel="minutes of training")
+    axes[0].set(xlabel="thousand samples", xscale="log", ylabel=f"solve rate, difficulty {options.difficulty}")
+    axes[1].set(xlabel="CPU minutes")
     for axis in axes:
         axis.grid(alpha=0.3)
         axis.set_ylim(0.0, 1.0)

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from mujoban_planner.boards import abstract_states, bit_boards
+from mujoban_planner.curves import read_curve
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.push_actor import PlayConfig
 from mujoban_planner.push_env import PUSHES
@@ -113,3 +114,11 @@ def test_a_policy_over_pushes_is_that_of_the_planner_that_ships_under_every_symm
 def test_a_planner_whose_decisions_do_not_follow_pushes_is_refused():
     with pytest.raises(ValueError, match="without propagation"):
         PushPolicy(ResidualPlanner(8, 1, propagation=False), untaught=True)
+
+
+def test_curves_are_drawn_against_samples_and_cpu_time(tmp_path):
+    trainer = ppo(tmp_path)
+    trainer.learner.evaluate = lambda: {"solve_rate/5": 0.25}
+    trainer.run()
+    ((samples, cpu_seconds, rate),) = read_curve(tmp_path, 5)
+    assert samples == 6 * 16 * 4 and cpu_seconds == trainer.progress.cpu_seconds > 0.0 and rate == 0.25
