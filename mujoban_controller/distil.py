@@ -46,7 +46,7 @@ class DistilConfig:
     """M."""
     sequence: int = 8
     """Ticks of a sequence in the replay, at least W."""
-    replay: int = 100_000
+    replay: int = 64_000
     """Frames in the replay."""
     first: int = 2_000
     """Frames before the first update."""

@@ -74,7 +74,7 @@ class TrainConfig:
     distil: DistilConfig = field(default_factory=DistilConfig)
     asymmetric: MPOTrainingConfig = field(
         default_factory=lambda: MPOTrainingConfig(
-            window=16, windows=16, sequence=16, replay=100_000, first=6_000, normalised=500
+            window=16, windows=16, sequence=16, replay=64_000, first=6_000, normalised=500
         )
     )
     """Of the stage mpo."""
