@@ -35,7 +35,7 @@ run: $(STAMP)
 	$(BIN)/python bringup/run_stack.py $(ARGS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n 2 $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -9,6 +9,7 @@ from typing import Any, Final, TypeVar
 
 from bringup.command import Stack, positive
 from bringup.results import EpisodeResult
+from mujoban_core.bodies import BALL
 from mujoban_core.threads import set_threads
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.episodes import Episodes, EpisodeSpec, LazyEpisodes
@@ -99,6 +100,7 @@ class _Share:
     world: str
     batch: int
     time_limit: int | None
+    body: str
 
 
 def evaluate_on_cluster(
@@ -107,6 +109,7 @@ def evaluate_on_cluster(
     address: str = HERE,
     *,
     num_actors: int,
+    body: str = BALL.name,
     world: str = DEFAULT_WORLD,
     batch: int = 64,
     time_limit: int | None = None,
@@ -122,13 +125,14 @@ def evaluate_on_cluster(
         episodes: Levels and seeds.
         address: See `spread`.
         num_actors: Number of processes.
+        body: The robot's body.
         world: The physical world, see `mujoban_sim.presets`.
         batch: Rows of each one's world.
         time_limit: Steps of an episode; None means that of the body.
         on_results: Called with all outcomes so far, in any order, when a process is done.
     """
     n = min(num_actors, len(episodes))
-    shares = [_Share(stack, EveryNth(episodes, first, n), world, batch, time_limit) for first in range(n)]
+    shares = [_Share(stack, EveryNth(episodes, first, n), world, batch, time_limit, body) for first in range(n)]
     ended: list[EpisodeResult] = []
 
     def on_result(_: int, results: list[EpisodeResult]) -> None:
@@ -145,6 +149,6 @@ def _play(share: _Share) -> list[EpisodeResult]:
 
     set_threads(share.stack.threads)
     return evaluate(
-        share.stack.policy(), share.episodes, world=share.world, batch=share.batch, time_limit=share.time_limit,
-        threads=share.stack.threads,
+        share.stack.policy(), share.episodes, body=share.body, world=share.world, batch=share.batch,
+        time_limit=share.time_limit, threads=share.stack.threads,
     )  # fmt: skip

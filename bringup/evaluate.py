@@ -139,10 +139,10 @@ def main(command_line: Sequence[str] | None = None) -> int:
     elif arguments.cluster:
         with SolvedBar(len(episodes)) as bar:
             results = evaluate_on_cluster(
-                stack, episodes, arguments.cluster, num_actors=arguments.num_actors, world=arguments.world,
-                batch=arguments.batch, time_limit=arguments.time_limit, on_results=bar.show,
+                stack, episodes, arguments.cluster, num_actors=arguments.num_actors, body=arguments.body,
+                world=arguments.world, batch=arguments.batch, time_limit=arguments.time_limit, on_results=bar.show,
             )  # fmt: skip
-        content = report(results, stack.identities(), world=arguments.world)
+        content = report(results, stack.identities(), body=arguments.body, world=arguments.world)
     else:
         results = evaluate(
             stack.policy(),
