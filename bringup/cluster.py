@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
-from bringup.command import Stack, positive
+from bringup.command import Stack
+from bringup.options import HERE
 from bringup.results import EpisodeResult
 from mujoban_core.bodies import BALL
 from mujoban_core.threads import set_threads
@@ -17,19 +17,8 @@ from mujoban_sokoban.episodes import Episodes, EpisodeSpec, LazyEpisodes
 JobT = TypeVar("JobT")
 ResultT = TypeVar("ResultT")
 
-HERE: Final = "here"
-"""Stands for a cluster on this machine, which is started for the command."""
 _RETRIES: Final = 3
 """Times that a job is done again when the process or the machine that does it dies."""
-
-
-def add_cluster_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that share a command's work out over a cluster."""
-    parser.add_argument(
-        "--cluster", nargs="?", const=HERE, metavar="ADDRESS",
-        help="share the work out over a Ray cluster (auto, HOST:PORT or ray://HOST:PORT; by default a new one here)",
-    )  # fmt: skip
-    parser.add_argument("--num-actors", type=positive, default=2, help="processes on the cluster")
 
 
 def spread(

@@ -1,4 +1,4 @@
-"""What the commands have in common: options, module selection, and one line on stderr for bad input.
+"""What the commands have in common: the modules that they play with, and the levels that may be recorded.
 
 Whatever takes long to import is imported where it is used, so that a command can tell its options, and be interrupted,
 at once.
@@ -6,70 +6,19 @@ at once.
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
-from mujoban_core.bodies import BALL, BODIES
-from mujoban_core.children import end_with_parent
-from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.bodies import BALL
 from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
 from mujoban_core.plugins import LEARNED, ORACLE, PRIVILEGED, ROLES, load_module, shipped_weights
-from mujoban_core.signals import interrupt_status, interruptible, interruption, leave
-from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 
 if TYPE_CHECKING:
     from mujoban_core.interfaces import Module
     from mujoban_core.sense_plan_act import SensePlanAct
-    from mujoban_sokoban.episodes import Episodes
-
-USAGE_ERROR = 2
-"""Exit status of a command whose input was bad."""
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser that reports an error in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print the error and leave."""
-        self.exit(USAGE_ERROR, f"{self.prog}: error: {message}\n")
-
-
-def run_command(prog: str, command: Callable[[], int]) -> NoReturn:
-    """Run a command and end the process with its `exit_status`."""
-    leave(exit_status(prog, command))
-
-
-def exit_status(prog: str, command: Callable[[], int]) -> int:
-    """Run a command and return its exit status.
-
-    Bad input is one line on stderr and status 2; a signal that asks the command to end is status 130 or 143.
-    """
-    end_with_parent()
-    try:
-        with interruptible():
-            return command()
-    except (ValueError, OSError) as error:
-        if (earlier := interruption(error)) is not None:
-            return interrupt_status(earlier)
-        say(f"{prog}: error: {' '.join(str(error).split())}")
-        return USAGE_ERROR
-    except KeyboardInterrupt as error:
-        say(f"{prog}: interrupted")
-        return interrupt_status(error)
-    except SystemExit as leaving:
-        return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
-
-
-def say(line: str) -> None:
-    """Print a line on stderr, if that can still be written to: the terminal may have been closed."""
-    with suppress(OSError):
-        print(line, file=sys.stderr, flush=True)
-
 
 @dataclass(frozen=True)
 class Choice:
@@ -171,69 +120,6 @@ def check_body(role: str, module: Module, body: str) -> None:
         )
 
 
-def positive(text: str) -> int:
-    """Read an integer from 1 on."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text} is too small: expected at least 1")
-    return number
-
-
-def add_episode_options(parser: argparse.ArgumentParser, *, episodes: int | None = None, seed: int = 0) -> None:
-    """Add the options that say which episodes are played."""
-    parser.add_argument(
-        "--difficulty", type=int, choices=sorted(DIFFICULTIES), default=max(DIFFICULTIES), help="of generated levels"
-    )
-    parser.add_argument("--episodes", type=positive, default=episodes, help="number of episodes")
-    parser.add_argument("--seed", type=int, default=seed, help="seed of the first episode; episode i has seed + i")
-    parser.add_argument("--time-limit", type=positive, metavar="STEPS", help="of an episode; the body's by default")
-    parser.add_argument("--levels", type=Path, metavar="FILE", help="play the levels of a Boxoban text file instead")
-    add_world_option(parser)
-
-
-def add_world_option(parser: argparse.ArgumentParser) -> None:
-    """Add the options that choose the physical world and the robot's body."""
-    parser.add_argument("--body", choices=sorted(BODIES), default=BALL.name, help="the robot's body")
-    parser.add_argument("--world", choices=WORLDS, default=DEFAULT_WORLD, help="physical world, see docs/world.md")
-
-
-def add_module_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that choose the modules."""
-    every = ",".join(ROLES)
-    parser.add_argument("--oracle", default="", metavar="ROLES", help=f"modules to replace by their oracle: {every}")
-    for role in ROLES:
-        parser.add_argument(
-            f"--{role}",
-            default=LEARNED,
-            metavar="WEIGHTS|MODULE:CLASS",
-            help=f"weights (.safetensors) of the learned {role}, or a class of your own to play it",
-        )
-    parser.add_argument("--device", default="cpu", help="device of the learned modules")
-    parser.add_argument("--threads", type=positive, default=1, help="threads of the networks and of batched physics")
-    parser.add_argument(
-        "--look-around",
-        type=int,
-        metavar="TICKS",
-        help="look around before the first decision, and walk to where more can be seen: the length of each turn on "
-        f"the spot, 0 for none; {LOOK_AROUND_TICKS} by default, 0 for the oracle estimator",
-    )
-    parser.add_argument(
-        "--look-ahead",
-        type=positive,
-        default=0,
-        metavar="N",
-        help="let the learned planner search ahead by N evaluations of its network as the robot moves; off by default",
-    )
-
-
-def add_recording_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say what may be recorded; `recorded_seed` reads them."""
-    parser.set_defaults(seed=None)
-    parser.add_argument(
-        "--allow-test-seeds", action="store_true", help="record also levels that are kept for tests, not for training"
-    )
-
-
 def recorded_seed(seed: int | None, *, records: bool, allow_test_seeds: bool) -> int:
     """Return the seed of the first episode: of those for training where it is recorded and nobody says otherwise.
 
@@ -257,37 +143,7 @@ def recorded_seed(seed: int | None, *, records: bool, allow_test_seeds: bool) ->
     return seed
 
 
-def episodes_from(arguments: argparse.Namespace) -> Episodes:
-    """Return the episodes that the options ask for; say on stderr which levels of a file are unsolvable."""
-    from mujoban_sokoban.episodes import Episodes
-    from mujoban_sokoban.solver import Status, solve_levels
-
-    episodes = Episodes(
-        arguments.episodes, arguments.seed, difficulty=arguments.difficulty, level_file=arguments.levels
-    )
-    if episodes.source.levels:
-        for index in (solve_levels(episodes.source.levels).status == Status.UNSOLVABLE).nonzero()[0]:
-            print(f"level {index} of {arguments.levels} is unsolvable; it is played all the same", file=sys.stderr)
-    return episodes
-
-
-def stack_from(arguments: argparse.Namespace) -> Stack:
-    """Return the modules that the options ask for.
-
-    Raises:
-        ValueError: If a role of `--oracle` is unknown.
-    """
-    choices = {role: Choice.parse(role, getattr(arguments, role)) for role in ROLES}
-    for role in filter(None, arguments.oracle.split(",")):
-        if role not in ROLES:
-            raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
-        choices[role] = _oracle(role, arguments.body)
-    return Stack(
-        choices, arguments.device, arguments.look_around, arguments.look_ahead, arguments.threads, arguments.body
-    )
-
-
-def _oracle(role: str, body: str) -> Choice:
+def oracle(role: str, body: str) -> Choice:
     """Return what knows the truth in a role; the script that drives the ball can drive no other body."""
     if role == "controller" and body != BALL.name:
         from mujoban_controller import teacher_weights

@@ -6,61 +6,48 @@ over the machines of a Ray cluster.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from tyro.conf import arg
 
-from bringup.cluster import EveryNth, add_cluster_options, evaluate_on_cluster
-from bringup.command import (
-    Parser,
-    add_episode_options,
-    add_module_options,
-    episodes_from,
-    import_from_here,
-    positive,
-    run_command,
-    stack_from,
-)
-from bringup.results import EpisodeResult, report, use_of_test_levels, write_report
-from bringup.rollout import rollout
+from bringup.command import Stack, import_from_here
+from bringup.options import HERE, ClusterOptions, Count, EpisodeOptions, FilePath, ModuleOptions
 from mujoban_core.bodies import BALL
-from mujoban_core.sense_plan_act import SensePlanAct
+from mujoban_core.files import check_file
+from mujoban_core.program import read_options, run_command
 from mujoban_core.threads import set_threads
 from mujoban_sim.presets import DEFAULT_WORLD
-from mujoban_sim.world import World
-from mujoban_sokoban.episodes import Episodes
-from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range
+
+if TYPE_CHECKING:
+    from bringup.cluster import EveryNth
+    from bringup.reporting import Reporting
+    from bringup.results import EpisodeResult
+    from mujoban_core.sense_plan_act import SensePlanAct
+    from mujoban_sokoban.episodes import Episodes
 
 PROG = "evaluate.py"
 
 
-class SolvedBar(Progress):
-    """How many episodes have ended, and how many of these were solved: a bar on stderr, or lines without a terminal."""
+@dataclass(frozen=True)
+class Options:
+    """Evaluate the stack on many levels in one vectorised rollout; by default on levels for validation."""
 
-    def __init__(self, total: int, *, disable: bool = False) -> None:
-        """Count to `total` episodes."""
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        super().__init__(*columns, console=Console(stderr=True), disable=disable)
-        self._task = self.add_task("solved", total=total)
-        self._total, self._printed = total, 0
+    play: Annotated[EpisodeOptions, arg(name="")] = field(default_factory=lambda: EpisodeOptions(episodes=256))
+    modules: Annotated[ModuleOptions, arg(name="")] = field(default_factory=ModuleOptions)
+    batch: Count = 64
+    """Episodes that run at the same time."""
+    shared: Annotated[ClusterOptions, arg(name="")] = field(default_factory=ClusterOptions)
+    graph: bool = False
+    """Play through the ROS graph instead."""
+    json: FilePath = None
+    """Write the report there."""
 
-    def show(self, results: Sequence[EpisodeResult]) -> None:
-        """Show the outcomes so far."""
-        if results:
-            share = sum(result.solved for result in results) / len(results)
-            solved = f"solved {100 * share:4.1f} %"
-            self.update(self._task, completed=len(results), description=solved)
-            self._print(len(results), solved)
-
-    def _print(self, ended: int, solved: str) -> None:
-        """Print a line whenever another tenth has ended, in a log, which shows a bar only when it is full."""
-        if self.disable or self.console.is_terminal or 10 * (ended - self._printed) < self._total:
-            return
-        self._printed = ended
-        self.console.print(f"{ended} of {self._total} episodes, {solved}")
+    def __post_init__(self) -> None:
+        """Reject what contradicts itself."""
+        if self.graph and self.shared.cluster:
+            raise ValueError("--graph --cluster: expected one of the two, since the graph plays on this machine")
 
 
 def evaluate(
@@ -72,7 +59,7 @@ def evaluate(
     batch: int = 64,
     time_limit: int | None = None,
     threads: int = 1,
-    progress: bool = False,
+    on_result: Callable[[int, EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
     """Play the episodes in one batched world and return their outcomes.
 
@@ -84,8 +71,11 @@ def evaluate(
         batch: Rows of the world.
         time_limit: Steps of an episode; None means that of the body.
         threads: Threads of the physics.
-        progress: Whether to show a progress bar on stderr.
+        on_result: Called with the index of an episode and its outcome as soon as it has ended.
     """
+    from bringup.rollout import rollout
+    from mujoban_sim.world import World
+
     robots = World(
         min(batch, len(episodes)),
         body=body,
@@ -94,75 +84,75 @@ def evaluate(
         time_limit=time_limit,
         threads=threads,
     )
-    with SolvedBar(len(episodes), disable=not progress) as bar:
-        ended: list[EpisodeResult] = []
-
-        def on_result(_: int, result: EpisodeResult) -> None:
-            ended.append(result)
-            bar.show(ended)
-
-        return rollout(policy, robots, episodes, on_result=on_result)
+    return rollout(policy, robots, episodes, on_result=on_result)
 
 
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    parser = Parser(PROG, description="Evaluate the stack on many levels in one vectorised rollout.")
-    add_episode_options(parser, episodes=256, seed=VALIDATION_SEEDS.start)
-    add_module_options(parser)
-    parser.add_argument("--batch", type=positive, default=64, help="episodes that run at the same time")
-    add_cluster_options(parser)
-    parser.add_argument("--graph", action="store_true", help="play through the ROS graph instead")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there instead of printing it")
-    arguments = parser.parse_args(command_line)
-    if arguments.graph and arguments.cluster:
-        parser.error("--graph --cluster: expected one of the two, since the graph plays on this machine")
+    options = read_options(Options, command_line, PROG, __doc__)
+    check_file("--json", options.json)
     import_from_here()
-    episodes, stack = episodes_from(arguments), stack_from(arguments)
-    from mujoban_rl.weights import provenance
+    from bringup.reporting import Reporting
+    from mujoban_sokoban.generator import VALIDATION_SEEDS
 
-    set_threads(arguments.threads)
-    if arguments.graph:
-        from bringup.stack import PlayOptions, play
-
-        options = PlayOptions(world=arguments.world, time_limit=arguments.time_limit)
-        with SolvedBar(len(episodes)) as bar:
-            outcome = play(
-                stack, episodes, options, on_refresh=lambda _, results: bar.show(results), refresh_period=1.0
-            )
-        content = report(
-            outcome.results,
-            stack.identities(),
-            body=arguments.body,
-            world=arguments.world,
-            ticks_per_second=outcome.ticks_per_second,
-        )
-    elif arguments.cluster:
-        with SolvedBar(len(episodes)) as bar:
-            results = evaluate_on_cluster(
-                stack, episodes, arguments.cluster, num_actors=arguments.num_actors, body=arguments.body,
-                world=arguments.world, batch=arguments.batch, time_limit=arguments.time_limit, on_results=bar.show,
-            )  # fmt: skip
-        content = report(results, stack.identities(), body=arguments.body, world=arguments.world)
-    else:
-        results = evaluate(
-            stack.policy(),
-            episodes,
-            body=arguments.body,
-            world=arguments.world,
-            batch=arguments.batch,
-            time_limit=arguments.time_limit,
-            threads=arguments.threads,
-            progress=True,
-        )
-        content = report(results, stack.identities(), body=arguments.body, world=arguments.world)
-    if arguments.levels is None and seed_range(arguments.seed, len(episodes)) == "test":
-        content["test_uses"] = [use_of_test_levels(content, provenance()["commit"])]
-    if arguments.json is None:
-        print(json.dumps(content, indent=2))
-    else:
-        write_report(content, arguments.json)
+    play = options.play
+    episodes = play.make(VALIDATION_SEEDS.start if play.seed is None else play.seed)
+    stack = options.modules.stack(play.body)
+    set_threads(stack.threads)
+    reporting = Reporting(
+        options.json, stack.identities(), len(episodes), generated=play.levels is None, body=play.body, world=play.world
+    )
+    with reporting:
+        results, extra = _play(options, stack, episodes, reporting)
+    reporting.finish(results, **extra)
     return 0
 
 
-if __name__ == "__main__":
+def _play(
+    options: Options, stack: Stack, episodes: Episodes, reporting: Reporting
+) -> tuple[Sequence[EpisodeResult], dict[str, Any]]:
+    """Play the episodes and return their outcomes, with further entries of the report."""
+    from bringup.progress import SolvedBar
+
+    play = options.play
+    policy = None if options.graph or options.shared.cluster else stack.policy()
+    with SolvedBar(len(episodes)) as bar:
+
+        def show(results: Sequence[EpisodeResult]) -> None:
+            reporting.results = results
+            bar.show(results)
+
+        if options.graph:
+            from bringup.stack import PlayOptions
+            from bringup.stack import play as play_graph
+
+            how = PlayOptions(world=play.world, time_limit=play.time_limit)
+            outcome = play_graph(stack, episodes, how, on_refresh=lambda _, ended: show(ended), refresh_period=1.0)
+            return outcome.results, {"ticks_per_second": outcome.ticks_per_second}
+        if policy is None:
+            from bringup.cluster import evaluate_on_cluster
+
+            return evaluate_on_cluster(
+                stack, episodes, options.shared.cluster or HERE, num_actors=options.shared.num_actors,
+                body=play.body, world=play.world, batch=options.batch, time_limit=play.time_limit, on_results=show,
+            ), {}  # fmt: skip
+        ended: list[EpisodeResult] = []
+        show(ended)
+
+        def on_result(_: int, result: EpisodeResult) -> None:
+            ended.append(result)
+            show(ended)
+
+        return evaluate(
+            policy, episodes, body=play.body, world=play.world, batch=options.batch,
+            time_limit=play.time_limit, threads=stack.threads, on_result=on_result,
+        ), {}  # fmt: skip
+
+
+def run() -> NoReturn:
+    """Run the command and end the process."""
     run_command(PROG, main)
+
+
+if __name__ == "__main__":
+    run()

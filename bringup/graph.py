@@ -17,10 +17,10 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from bringup.command import USAGE_ERROR
 from bringup.parameters import Parameters, write_parameters
 from mujoban_controller.node import ControllerNode
 from mujoban_core import children
+from mujoban_core.program import USAGE_ERROR
 from mujoban_estimator.node import EstimatorNode
 from mujoban_estimator.termination_node import TerminationNode
 from mujoban_msgs_py.runtime.module_node import ModuleNode

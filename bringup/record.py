@@ -7,38 +7,31 @@ more than the states that it would visit; `--undisturbed` leaves it alone. Sever
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, NoReturn
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
+from tyro.conf import arg
 
-from bringup.cluster import add_cluster_options, spread
-from bringup.command import (
-    Parser,
-    Stack,
-    add_module_options,
-    add_recording_options,
-    add_world_option,
-    import_from_here,
-    recorded_seed,
-    run_command,
-    stack_from,
-)
+from bringup.cluster import spread
+from bringup.command import Stack, import_from_here, recorded_seed
 from bringup.exploration import Disturbance, disturbed
+from bringup.options import ClusterOptions, Count, ModuleOptions, WorldOptions, one_of, whole
 from bringup.rollout import ticks
 from mujoban_core import children
 from mujoban_core.bodies import BALL
+from mujoban_core.files import check_folder
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.program import read_options, run_command
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.signals import StopSignal, interrupt_status, interruptible, leave
 from mujoban_core.threads import set_threads
@@ -101,6 +94,45 @@ class MixedEpisodes(LazyEpisodes):
             moves = solve_level(level, weight=2.0).moves
             level = after_moves(level, moves[: rng.integers(0, max(1, len(moves) - 2))])
         return EpisodeSpec(level, seed)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Record many episodes as bags, quickly."""
+
+    out: Annotated[Path, arg(metavar="DIR")]
+    """New folder for the bags."""
+    episodes: Count = 256
+    """Number of episodes."""
+    difficulty: tuple[Annotated[int, one_of(sorted(DIFFICULTIES))], ...] = (1, 2, 3, 4, 5, 5, 5, 5)
+    """Difficulties to draw from; one that is named twice comes twice as often."""
+    seed: Annotated[int | None, whole("N", 0)] = None
+    """Of the first episode; by default the first for training."""
+    allow_test_seeds: bool = False
+    """Record also levels that are kept for tests, not for training."""
+    advanced: float = 0.5
+    """Share of episodes that begin along a solution."""
+    time_limit: Annotated[int, whole("STEPS", 0)] = 600
+    """Steps of an episode; 0: those of the body."""
+    batch: Count = 32
+    """Episodes at the same time in each process."""
+    processes: Count = 2
+    """Processes that share the work."""
+    shared: Annotated[ClusterOptions, arg(name="")] = field(default_factory=ClusterOptions)
+    undisturbed: bool = False
+    """Let the policy do as it will."""
+    physics: Annotated[WorldOptions, arg(name="")] = field(default_factory=WorldOptions)
+    modules: Annotated[ModuleOptions, arg(name="")] = field(default_factory=ModuleOptions)
+
+    def __post_init__(self) -> None:
+        """Reject what contradicts itself."""
+        if self.physics.body != BALL.name and not self.undisturbed:
+            raise ValueError(f"--body {self.physics.body}: disturbances roll and steer a ball; expected --undisturbed")
+
+    @property
+    def parts(self) -> int:
+        """Number of processes among which the episodes are shared out."""
+        return min(self.shared.num_actors if self.shared.cluster else self.processes, self.episodes)
 
 
 @dataclass(frozen=True)
@@ -245,21 +277,16 @@ def gather(answers: Sequence[Connection], on_end: Callable[[int], None]) -> int:
 
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    arguments = _arguments(command_line)
+    options = read_options(Options, command_line, PROG, __doc__)
     import_from_here()
-    if arguments.out.exists() and any(arguments.out.iterdir()):
-        raise ValueError(f"{arguments.out} is not empty: expected a new folder for the bags")
-    if arguments.processes < 1 or arguments.batch < 1:
-        raise ValueError(f"{arguments.processes} processes, batch {arguments.batch}: expected at least 1")
-    arguments.seed = recorded_seed(arguments.seed, records=True, allow_test_seeds=arguments.allow_test_seeds)
-    if arguments.cluster:
-        arguments.processes = arguments.num_actors
-    jobs = [_job(arguments, part) for part in range(min(arguments.processes, arguments.episodes))]
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    check_folder("--out", options.out)
+    seed = recorded_seed(options.seed, records=True, allow_test_seeds=options.allow_test_seeds)
+    jobs = [_job(options, seed, part) for part in range(options.parts)]
+    options.out.mkdir(parents=True, exist_ok=True)
     with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("recorded", total=arguments.episodes)
-        total = _record_all(jobs, arguments.cluster, lambda ended: progress.update(task, advance=ended))
-    print(f"{total} ticks of {arguments.episodes} episodes in {len(list(arguments.out.iterdir()))} bags")
+        task = progress.add_task("recorded", total=options.episodes)
+        total = _record_all(jobs, options.shared.cluster, lambda ended: progress.update(task, advance=ended))
+    print(f"{total} ticks of {options.episodes} episodes in {len(list(options.out.iterdir()))} bags")
     return 0
 
 
@@ -273,48 +300,30 @@ def _record_all(jobs: Sequence[Job], cluster: str | None, on_end: Callable[[int]
     return sum(done)
 
 
-def _arguments(command_line: Sequence[str] | None) -> argparse.Namespace:
-    parser = Parser(PROG, description="Record many episodes as bags, quickly.")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the bags")
-    parser.add_argument("--episodes", type=int, default=256, help="number of episodes")
-    parser.add_argument(
-        "--difficulty", type=int, nargs="+", default=[1, 2, 3, 4, 5, 5, 5, 5],
-        help="difficulties to draw from; one that is named twice comes twice as often",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=int, help="of the first episode; by default the first for training")
-    add_recording_options(parser)
-    parser.add_argument("--advanced", type=float, default=0.5, help="share of episodes that begin along a solution")
-    parser.add_argument("--time-limit", type=int, default=600, help="ticks of an episode; 0: those of the body")
-    parser.add_argument("--batch", type=int, default=32, help="episodes at the same time in each process")
-    parser.add_argument("--processes", type=int, default=2, help="processes that share the work")
-    add_cluster_options(parser)
-    parser.add_argument("--undisturbed", action="store_true", help="let the policy do as it will")
-    add_world_option(parser)
-    add_module_options(parser)
-    return parser.parse_args(command_line)
-
-
-def _job(arguments: argparse.Namespace, part: int) -> Job:
-    """Return what process number `part` records: every `processes`-th episode."""
-    if arguments.body != BALL.name and not arguments.undisturbed:
-        raise ValueError(f"--body {arguments.body}: disturbances roll and steer a ball; expected --undisturbed")
-    processes = min(arguments.processes, arguments.episodes)
+def _job(options: Options, seed: int, part: int) -> Job:
+    """Return what process number `part` records: every `parts`-th episode."""
+    parts = options.parts
     episodes = MixedEpisodes(
-        len(range(part, arguments.episodes, processes)), arguments.seed + part, arguments.difficulty,
-        advanced=arguments.advanced, stride=processes,
+        len(range(part, options.episodes, parts)), seed + part, options.difficulty, advanced=options.advanced,
+        stride=parts,
     )  # fmt: skip
     return Job(
-        out=arguments.out,
+        out=options.out,
         prefix=f"part{part}_",
         episodes=episodes,
-        stack=stack_from(arguments),
-        disturbance=None if arguments.undisturbed else Disturbance(),
-        batch=arguments.batch,
-        time_limit=arguments.time_limit or None,
-        seed=arguments.seed + part,
-        world=arguments.world,
+        stack=options.modules.stack(options.physics.body),
+        disturbance=None if options.undisturbed else Disturbance(),
+        batch=options.batch,
+        time_limit=options.time_limit or None,
+        seed=seed + part,
+        world=options.physics.world,
     )
 
 
-if __name__ == "__main__":
+def run() -> NoReturn:
+    """Run the command and end the process."""
     run_command(PROG, main)
+
+
+if __name__ == "__main__":
+    run()

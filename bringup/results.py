@@ -79,6 +79,34 @@ def report(results: Sequence[EpisodeResult], weights: Mapping[str, str], **extra
     }
 
 
+SEEDS_SHOWN = 12
+"""Seeds of lost episodes that a summary names for each cause."""
+
+
+def summary(content: Mapping[str, Any]) -> list[str]:
+    """Return a report in a few lines: rate, interval and return, then the seeds of lost episodes by cause."""
+    episodes = content["episodes"]
+    solved = sum(entry["solved"] for entry in episodes)
+    low, high = (100 * bound for bound in content["success_interval"])
+    head = (
+        f"solved {solved} of {len(episodes)} ({100 * content['success_rate']:.1f} %, 95 % interval {low:.1f} to "
+        f"{high:.1f} %), mean return {content['mean_return']:.2f}"
+    )
+    lines = [head]
+    if "ticks_per_second" in content:
+        lines[0] += f", {content['ticks_per_second']:.0f} ticks/s"
+    if "interrupted" in content:
+        lines.append(f"interrupted: {content['interrupted']} episodes were asked for, and long ones are missing most")
+    for cause, count in content["failures"].items():
+        seeds = [str(entry["seed"]) for entry in episodes if entry["failure"] == cause]
+        more = f" and {count - SEEDS_SHOWN} more" if count > SEEDS_SHOWN else ""
+        lines.append(f"lost by {cause}: {count} (seeds {', '.join(seeds[:SEEDS_SHOWN])}{more})")
+    if content["privileged"]:
+        told = ", ".join(f"{role}: {content['weights'][role]}" for role in content["privileged"])
+        lines.append(f"privileged, told the ground truth: {told}")
+    return lines + [f"{event}: {count}" for event, count in sorted(content.get("counts", {}).items())]
+
+
 def use_of_test_levels(content: Mapping[str, Any], commit: str | None) -> dict[str, Any]:
     """Return the entry of a report's `test_uses` list: what was evaluated on test levels, and on which.
 
@@ -92,7 +120,7 @@ def use_of_test_levels(content: Mapping[str, Any], commit: str | None) -> dict[s
 
 def write_report(content: Mapping[str, Any], path: Path) -> None:
     """Write a report as JSON, whole or not at all; uses of the test range that the file lists are kept."""
-    if path.exists() and "test_uses" in content:
+    if path.is_file() and "test_uses" in content:
         content = {**content, "test_uses": [*_noted_uses(path), *content["test_uses"]]}
     write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 

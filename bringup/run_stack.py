@@ -2,120 +2,119 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
-from bringup.command import (
-    Parser,
-    add_episode_options,
-    add_module_options,
-    add_recording_options,
-    episodes_from,
-    import_from_here,
-    positive,
-    recorded_seed,
-    run_command,
-    stack_from,
-)
+from tyro.conf import arg
+
+from bringup.command import import_from_here, recorded_seed
+from bringup.options import SPEED, Count, EpisodeOptions, FilePath, FolderPath, ModuleOptions
+from mujoban_core.files import check_file, check_folder
+from mujoban_core.program import read_options, run_command
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from bringup.stack import Outcome
+    from bringup.monitor import MonitorNode
+    from bringup.results import EpisodeResult
 
 PROG = "run_stack.py"
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """Read the command line."""
-    parser = Parser(PROG, description="Play Mujoban through the ROS graph; without options, one hard episode.")
-    add_episode_options(parser)
-    add_module_options(parser)
-    parser.add_argument(
-        "--realtime", nargs="?", type=_speed, const=1.0, default=0.0, metavar="SPEED",
-        help="pace the world by the clock, SPEED (1) times as fast as reality, instead of in lockstep",
-    )  # fmt: skip
-    parser.add_argument("--processes", action="store_true", help="run each node in a process of its own")
-    parser.add_argument("--headless", action="store_true", help="show no live view")
-    parser.add_argument("--record", type=Path, metavar="DIR", help="record all topics into a bag")
-    add_recording_options(parser)
-    parser.add_argument("--episodes-per-file", type=positive, default=32, metavar="N", help="of the bag")
-    parser.add_argument("--video", type=Path, metavar="FILE", help="write an .mp4 of the robot's view and from above")
-    parser.add_argument("--view", action="store_true", help="serve a live view (Rerun) to the browser")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there")
-    return parser.parse_args(arguments)
+@dataclass(frozen=True)
+class Options:
+    """Play Mujoban through the ROS graph; without options, one hard episode."""
+
+    play: Annotated[EpisodeOptions, arg(name="")] = field(default_factory=EpisodeOptions)
+    modules: Annotated[ModuleOptions, arg(name="")] = field(default_factory=ModuleOptions)
+    realtime: Annotated[float, SPEED] = 0.0
+    """Pace the world by the clock, SPEED (1) times as fast as reality, instead of in lockstep."""
+    processes: bool = False
+    """Run each node in a process of its own."""
+    headless: bool = False
+    """Show no live view."""
+    record: FolderPath = None
+    """Record all topics into a bag."""
+    allow_test_seeds: bool = False
+    """Record also levels that are kept for tests, not for training."""
+    episodes_per_file: Count = 32
+    """Episodes in one file of the bag."""
+    video: FilePath = None
+    """Write an .mp4 of the robot's view and from above."""
+    view: bool = False
+    """Serve a live view (Rerun) to the browser."""
+    json: FilePath = None
+    """Write the report there."""
 
 
-def _speed(text: str) -> float:
-    speed = float(text)
-    if not (0 < speed < float("inf")):
-        raise argparse.ArgumentTypeError(f"{text} is no speed: expected a number above 0")
-    return speed
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = parse(arguments)
+    options = read_options(Options, command_line, PROG)
+    play, stack = options.play, options.modules.stack(options.play.body)
     import_from_here()
-    options.seed = recorded_seed(
-        options.seed, records=options.record is not None, allow_test_seeds=options.allow_test_seeds
-    )
-    episodes, stack = episodes_from(options), stack_from(options)
+    seed = recorded_seed(play.seed, records=options.record is not None, allow_test_seeds=options.allow_test_seeds)
+    check_folder("--record", options.record)
+    check_file("--video", options.video)
+    check_file("--json", options.json)
+    episodes = play.make(seed)
 
     from rich.console import Console
 
-    from bringup.results import report, write_report
-    from bringup.stack import PlayOptions, play
-    from bringup.view import on_terminal
+    from bringup.reporting import Reporting
+    from bringup.stack import PlayOptions
+    from bringup.stack import play as play_graph
+    from bringup.view import summary
 
-    weights = stack.identities()
-    console = Console()
-    play_options = PlayOptions(
-        world=options.world,
+    how = PlayOptions(
+        world=play.world,
         realtime=options.realtime,
-        time_limit=options.time_limit,
+        time_limit=play.time_limit,
         processes=options.processes,
         record=options.record,
         episodes_per_file=options.episodes_per_file,
         video=options.video,
         view=options.view,
     )
-    with nullcontext() if options.headless else on_terminal(console, weights) as on_refresh:
-        outcome = play(stack, episodes, play_options, on_refresh=on_refresh)
-    content = report(
-        outcome.results,
-        weights,
-        body=options.body,
-        world=options.world,
-        ticks_per_second=outcome.ticks_per_second,
-        counts=dict(outcome.counts),
+    weights = stack.identities()
+    reporting = Reporting(
+        options.json, weights, len(episodes), generated=play.levels is None, body=play.body, world=play.world
     )
-    _sum_up(console, outcome, weights, content["success_interval"])
-    if options.json is not None:
-        write_report(content, options.json)
+    with reporting, _shown(len(episodes), None if options.headless else weights) as show:
+
+        def on_refresh(monitor: MonitorNode, results: Sequence[EpisodeResult]) -> None:
+            reporting.results = results
+            show(monitor, results)
+
+        outcome = play_graph(stack, episodes, how, on_refresh=on_refresh)
+    if not options.headless:
+        Console().print(summary(outcome.results))
+    reporting.finish(outcome.results, ticks_per_second=outcome.ticks_per_second, counts=dict(outcome.counts))
     return 0
 
 
-def _sum_up(console: Console, outcome: Outcome, weights: Mapping[str, str], interval: Sequence[float]) -> None:
-    from bringup.view import summary
-    from mujoban_core.plugins import is_privileged
+@contextmanager
+def _shown(
+    episodes: int, weights: Mapping[str, str] | None
+) -> Iterator[Callable[[MonitorNode, Sequence[EpisodeResult]], None]]:
+    """Return what shows how the run goes: the latest tick, played with these weights; None: a line of progress."""
+    if weights is None:
+        from bringup.progress import SolvedBar
 
-    console.print(summary(outcome.results))
-    solved, total = sum(r.solved for r in outcome.results), len(outcome.results)
-    low, high = (100 * bound for bound in interval)
-    console.print(
-        f"solved {solved} of {total} ({100 * solved / total:.1f} %, 95 % interval {low:.1f} to {high:.1f} %), "
-        f"{outcome.ticks_per_second:.0f} ticks/s"
-    )
-    told = [f"{role}: {identity}" for role, identity in weights.items() if is_privileged(identity)]
-    if told:
-        console.print(f"privileged, told the ground truth: {', '.join(told)}")
-    for event, count in sorted(outcome.counts.items()):
-        console.print(f"{event}: {count}")
+        with SolvedBar(episodes) as bar:
+            yield lambda _, results: bar.show(results)
+    else:
+        from rich.console import Console
+
+        from bringup.view import on_terminal
+
+        with on_terminal(Console(), weights) as show:
+            yield show
+
+
+def run() -> NoReturn:
+    """Run the command and end the process."""
+    run_command(PROG, main)
 
 
 if __name__ == "__main__":
-    run_command(PROG, main)
+    run()

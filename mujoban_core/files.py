@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_DEVICES = (Path("/dev"), Path("/proc"))
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a place to write a file, which replaces `path` at the end; a crash leaves the old or the new one."""
+    path = path.resolve()
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield temporary
@@ -22,6 +26,77 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file such that a crash leaves either the old or the new content."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
+    """Write a file such that a crash leaves either the old or the new content.
+
+    A device or a pipe is written to, and never replaced.
+
+    Raises:
+        OSError: If it cannot be written; the error names the file.
+    """
+    with naming(path):
+        if is_device(path):
+            with path.open("wb") as file:
+                file.write(data)
+        else:
+            with replacing(path) as temporary:
+                temporary.write_bytes(data)
+
+
+def is_device(path: Path) -> bool:
+    """Return whether a path is of no file or folder, but of a device or a pipe, as /dev/null and /dev/stdout are."""
+    special = path.exists() and not path.is_file() and not path.is_dir()
+    return special or any(path.absolute().is_relative_to(folder) for folder in _DEVICES)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Name the file in an error of the system that does not, such as that of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or error.filename == str(path):
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+
+
+def check_file(option: str, path: Path | None) -> None:
+    """Check that a file can be written, before the work that it is to take; the file stays as it is.
+
+    Args:
+        option: What the user has named it by.
+        path: The file; None: there is none to check.
+
+    Raises:
+        ValueError: If it is a folder, or there is no folder for it.
+        OSError: If it may not be written.
+    """
+    if path is None or is_device(path):
+        return
+    if path.is_dir():
+        raise ValueError(f"{option} {path}: is a folder, expected the name of a file")
+    folder = path.resolve().parent
+    if not folder.is_dir():
+        raise ValueError(f"{option} {path}: no such folder {folder}, expected one that exists")
+    _check_room(option, path, folder)
+
+
+def check_folder(option: str, path: Path | None) -> None:
+    """Check that a new folder can be made, with those above it; see `check_file`."""
+    if path is None:
+        return
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"{option} {path}: is a file, expected a new folder")
+    if path.exists() and any(path.iterdir()):
+        raise ValueError(f"{option} {path}: is not empty, expected a new folder")
+    above = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+    _check_room(option, path, above)
+
+
+def _check_room(option: str, path: Path, folder: Path) -> None:
+    """Check that a file can be made in a folder; permissions do not tell, for root and on read-only disks."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b" ")
+    except OSError as error:
+        why = os.strerror(error.errno or 0)
+        raise ValueError(f"{option} {path}: {why}, expected a place that can be written to") from error

@@ -152,7 +152,7 @@ def usable_device(device: str | torch.device) -> torch.device:
     if chosen.type not in ("cpu", "cuda"):
         raise WeightsError(f"device {str(device)!r}: expected cpu or cuda, such as cuda:0")
     if chosen.type == "cuda" and (chosen.index or 0) >= (found := torch.cuda.device_count()):
-        raise WeightsError(f"device {str(device)!r}: this machine has {found} CUDA devices that torch can use")
+        raise WeightsError(f"device {str(device)!r}: torch can use {found} CUDA devices here, expected cpu")
     return chosen
 
 

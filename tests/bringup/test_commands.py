@@ -12,7 +12,8 @@ import imageio.v2 as imageio
 import pytest
 
 from bringup import evaluate, run_stack
-from bringup.command import exit_status, recorded_seed
+from bringup.command import recorded_seed
+from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.bags.training import episode_ticks, open_training_bag
@@ -70,6 +71,83 @@ def test_every_use_of_the_test_levels_is_kept_in_the_report(tmp_path):
     assert all(use["weights"]["planner"] == "oracle" and "commit" in use for use in uses)
 
 
+def test_a_summary_on_the_terminal_names_lost_seeds_by_cause(capfd):
+    options = ("--difficulty", 1, "--episodes", 2, "--seed", 1000, "--time-limit", 3)
+    for command in (partial(run, evaluate), partial(run, run_stack, "--headless")):
+        assert command(*options, *ALL_ORACLES) == 0
+        captured = capfd.readouterr()
+        rate, cause, privileged = captured.out.splitlines()
+        assert rate.startswith("solved 0 of 2 (0.0 %, 95 % interval 0.0 to 65.8 %), mean return ")
+        assert cause == "lost by time limit: 2 (seeds 1000, 1001)"
+        assert privileged.startswith("privileged, told the ground truth: estimator: oracle")
+        assert "2/2" in captured.err
+
+
+def test_an_interrupted_evaluation_reports_what_it_has(tmp_path):
+    path = tmp_path / "report.json"
+    command = [sys.executable, "bringup/evaluate.py", "--difficulty", "1", "--episodes", "400", "--batch", "2"]
+    root = Path(run_stack.__file__).parents[1]
+    process = subprocess.Popen(
+        [*command, *ALL_ORACLES, "--time-limit", "20", "--json", str(path)], cwd=root, stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    process.stderr.readline()  # a tenth is played
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and err.strip().endswith("interrupted")
+    content = json.loads(path.read_text())
+    assert content["interrupted"] == 400 and 40 <= len(content["episodes"]) < 400
+    assert "interrupted: 400 episodes were asked for" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--json", "no/folder/report.json"], "no such folder"),
+        (["--json", "."], "is a folder"),
+        (["--video", "no/film.mp4"], "no such folder"),
+        (["--record", "."], "is not empty"),
+        (["--record", "/proc/bag"], "expected a place that can be written to"),
+    ],
+)
+def test_places_for_output_are_checked_before_anything_is_played(capfd, monkeypatch, options, why):
+    monkeypatch.setattr("bringup.command.Stack.identities", lambda stack: pytest.fail("went on"))
+    assert run(run_stack, "--headless", *options) == 2
+    err = capfd.readouterr().err.strip()
+    assert f"error: {options[0]} {options[1]}: " in err and why in err and "\n" not in err
+
+
+def test_a_report_goes_through_a_device_and_never_replaces_it(tmp_path, capfd):
+    few = ["--difficulty", 1, "--episodes", 1, "--time-limit", 3, *ALL_ORACLES]
+    null = tmp_path / "null"
+    null.symlink_to("/dev/null")
+    assert run(evaluate, *few, "--json", null) == 0 and run(evaluate, *few, "--json", "/dev/null") == 0
+    assert null.is_symlink() and Path("/dev/null").is_char_device()
+    assert run(evaluate, *few, "--json", "/dev/full") == 2
+    assert capfd.readouterr().err.splitlines()[-1] == "command: error: /dev/full: No space left on device"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--difficulty", "9"], "--difficulty 9, expected one of 1, 2, 3, 4, 5"),
+        (["--episodes", "0"], "--episodes 0, expected a whole number from 1 on"),
+        (["--heedless"], "unrecognized options: --heedless, expected --headless"),
+        (["--json"], "missing value for argument '--json'. Expected 1 values."),
+        (["--realtime", "1", "2"], "--realtime 1 2, expected a number above 0"),
+    ],
+)
+def test_a_wrong_option_is_one_line_that_tells_what_is_expected(capfd, options, said):
+    assert run(run_stack, *options) == 2
+    assert capfd.readouterr().err == f"command: error: {said}\n"
+
+
+def test_a_missing_gpu_is_one_line(capfd):
+    assert run(evaluate, "--device", "cuda:99") == 2
+    err = capfd.readouterr().err
+    assert "cuda:99" in err and "expected" in err and err.count("\n") == 1
+
+
 def test_evaluate_gives_the_same_in_process_and_through_the_graph(tmp_path):
     reports = []
     for extra in ([], ["--graph"]):
@@ -86,7 +164,7 @@ def test_an_unsolvable_level_is_played_and_said_to_be(tmp_path, capfd):
     assert run(evaluate, "--levels", levels, "--episodes", 1, *ALL_ORACLES, "--time-limit", 5) == 0
     captured = capfd.readouterr()
     assert "level 0" in captured.err and "unsolvable" in captured.err
-    assert json.loads(captured.out)["success_rate"] == 0.0
+    assert captured.out.startswith("solved 0 of 1 (0.0 %") and "dead end: 1 (seeds 5000000)" in captured.out
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,170 @@
+"""The options that programs share: the same one for the same thing everywhere.
+
+A program embeds them with `Annotated[ModuleOptions, tyro.conf.arg(name="")]`. Whatever takes long to import is
+imported where it is used, so that a program can tell its options at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import arg
+from tyro.constructors import PrimitiveConstructorSpec
+
+from bringup.command import Choice, Stack, oracle
+from mujoban_core.bodies import BALL, BODIES
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.plugins import LEARNED, ROLES
+from mujoban_core.program import say
+from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
+
+if TYPE_CHECKING:
+    from mujoban_sokoban.episodes import Episodes
+
+HERE = "here"
+"""Stands for a cluster on this machine, which is started for the command."""
+
+
+def _spec(metavar: str, read: Callable[[list[str]], Any], *, optional: bool = False) -> PrimitiveConstructorSpec[Any]:
+    """Return what reads a value, which may be left out where it is optional."""
+    return PrimitiveConstructorSpec(
+        nargs="*" if optional else 1, metavar=metavar, instance_from_str=read, is_instance=lambda _: True,
+        str_from_instance=lambda value: [str(value)],
+    )  # fmt: skip
+
+
+def one_of(values: Iterable[Any]) -> PrimitiveConstructorSpec[Any]:
+    """Return what reads one of some values."""
+    named = {str(value): value for value in values}
+
+    def read(given: list[str]) -> Any:
+        if given[0] not in named:
+            raise ValueError(f"{given[0]}, expected one of {', '.join(named)}")
+        return named[given[0]]
+
+    return _spec("|".join(named), read)
+
+
+def whole(metavar: str, least: int = 1) -> PrimitiveConstructorSpec[Any]:
+    """Return what reads a whole number from `least` on."""
+
+    def read(given: list[str]) -> int:
+        if not given[0].lstrip("-").isdecimal() or int(given[0]) < least:
+            raise ValueError(f"{given[0]}, expected a whole number from {least} on")
+        return int(given[0])
+
+    return _spec(metavar, read)
+
+
+def _speed(given: list[str]) -> float:
+    try:
+        speed = float(*given) if given else 1.0
+    except (ValueError, TypeError):
+        speed = 0.0
+    if not 0.0 < speed < float("inf"):
+        raise ValueError(f"{' '.join(given)}, expected a number above 0")
+    return speed
+
+
+def _address(given: list[str]) -> str:
+    if len(given) > 1:
+        raise ValueError(f"{' '.join(given)}, expected one address")
+    return given[0] if given else HERE
+
+
+SPEED = _spec("[SPEED]", _speed, optional=True)
+ADDRESS = _spec("[ADDRESS]", _address, optional=True)
+
+ModuleSource = Annotated[str, arg(metavar="WEIGHTS|MODULE:CLASS|NAME")]
+FilePath = Annotated[Path | None, arg(metavar="FILE")]
+FolderPath = Annotated[Path | None, arg(metavar="DIR")]
+Count = Annotated[int, whole("N")]
+
+
+@dataclass(frozen=True)
+class ModuleOptions:
+    """Which modules play, and how."""
+
+    estimator: ModuleSource = LEARNED
+    """Weights (.safetensors) of the learned estimator, a class of your own, or the name of an installed module."""
+    termination: ModuleSource = LEARNED
+    """The same for the termination."""
+    planner: ModuleSource = LEARNED
+    """The same for the planner."""
+    controller: ModuleSource = LEARNED
+    """The same for the controller."""
+    oracle: Annotated[str, arg(metavar="ROLES")] = ""
+    """Modules to replace by their oracle: some of estimator,termination,planner,controller."""
+    device: str = "cpu"
+    """Device of the learned modules: cpu or cuda, such as cuda:0."""
+    threads: Count = 1
+    """Threads of the networks and of batched physics."""
+    look_around: Annotated[int | None, whole("TICKS", 0)] = None
+    """Look around before the first decision, and walk to where more can be seen: the length of each turn on the spot,
+    0 for none; by default that of docs/estimator.md, 0 for the oracle estimator."""
+
+    look_ahead: Annotated[int, whole("N", 0)] = 0
+    """Let the learned planner search ahead by N evaluations of its network as the robot moves; 0 for none."""
+
+    def stack(self, body: str = BALL.name) -> Stack:
+        """Return the modules.
+
+        Raises:
+            ValueError: If a role of `--oracle` is unknown.
+        """
+        choices = {role: Choice.parse(role, getattr(self, role)) for role in ROLES}
+        for role in filter(None, self.oracle.split(",")):
+            if role not in ROLES:
+                raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
+            choices[role] = oracle(role, body)
+        return Stack(choices, self.device, self.look_around, self.look_ahead, self.threads, body)
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """The physical world and the robot in it."""
+
+    body: Annotated[str, one_of(sorted(BODIES))] = BALL.name
+    """The robot's body."""
+    world: Annotated[str, one_of(WORLDS)] = DEFAULT_WORLD
+    """Physical world, see docs/world.md."""
+
+
+@dataclass(frozen=True)
+class EpisodeOptions(WorldOptions):
+    """Which episodes are played."""
+
+    difficulty: Annotated[int, one_of(sorted(DIFFICULTIES))] = max(DIFFICULTIES)
+    """Difficulty of generated levels."""
+    episodes: Annotated[int | None, whole("N")] = None
+    """Number of episodes; by default one, or as many as the level file has."""
+    seed: Annotated[int | None, whole("N", 0)] = None
+    """Seed of the first episode; episode i has seed + i."""
+    time_limit: Annotated[int | None, whole("STEPS")] = None
+    """Steps of an episode; by default those of the body."""
+    levels: FilePath = None
+    """Play the levels of a Boxoban text file instead of generated ones."""
+
+    def make(self, seed: int) -> Episodes:
+        """Return the episodes from a seed on; say on stderr which levels of a file are unsolvable."""
+        from mujoban_sokoban.episodes import Episodes
+        from mujoban_sokoban.solver import Status, solve_levels
+
+        episodes = Episodes(self.episodes, seed, difficulty=self.difficulty, level_file=self.levels)
+        if episodes.source.levels:
+            for index in (solve_levels(episodes.source.levels).status == Status.UNSOLVABLE).nonzero()[0]:
+                say(f"level {index} of {self.levels} is unsolvable; it is played all the same")
+        return episodes
+
+
+@dataclass(frozen=True)
+class ClusterOptions:
+    """Whether a command's work is shared out over a cluster."""
+
+    cluster: Annotated[str | None, ADDRESS] = None
+    """Share the work out over a Ray cluster (auto, HOST:PORT or ray://HOST:PORT); without ADDRESS a new one here."""
+    num_actors: Count = 2
+    """Processes on the cluster."""

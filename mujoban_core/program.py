@@ -1,0 +1,121 @@
+"""What all programs have in common: options by tyro, one line on stderr for bad input, one end for signals.
+
+A program's options are a dataclass; its `main` reads them and is run by `run_command`:
+
+    def main(command_line: Sequence[str] | None = None) -> int:
+        options = read_options(Options, command_line, PROG)
+        ...
+
+    def run() -> NoReturn:
+        run_command(PROG, main)
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, suppress
+from pathlib import Path
+from typing import Any, Final, NoReturn, TypeVar
+
+from mujoban_core.children import end_with_parent
+from mujoban_core.signals import interrupt_status, interruptible, interruption, leave
+
+OptionsT = TypeVar("OptionsT")
+
+USAGE_ERROR: Final = 2
+"""Exit status of a command whose input was bad."""
+_SCRIPTS: Final = "mujoban-"
+"""Start of the names of the installed commands."""
+
+
+def run_command(prog: str, command: Callable[[], int]) -> NoReturn:
+    """Run a command and end the process with its `exit_status`."""
+    leave(exit_status(called(prog), command))
+
+
+def called(prog: str) -> str:
+    """Return the name that a program was called by: that of its installed command, or its own."""
+    name = Path(sys.argv[0]).name
+    return name if name.startswith(_SCRIPTS) else prog
+
+
+def exit_status(prog: str, command: Callable[[], int]) -> int:
+    """Run a command and return its exit status.
+
+    Bad input is one line on stderr and status 2; a signal that asks the command to end is status 130 or 143.
+    """
+    end_with_parent()
+    try:
+        with interruptible():
+            return command()
+    except (ValueError, OSError) as error:
+        if (earlier := interruption(error)) is not None:
+            return interrupt_status(earlier)
+        say(f"{prog}: error: {reason(error)}")
+        return USAGE_ERROR
+    except KeyboardInterrupt as error:
+        say(f"{prog}: interrupted")
+        return interrupt_status(error)
+    except SystemExit as leaving:
+        return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
+
+
+def reason(error: Exception) -> str:
+    """Return in one line what an error says; of the system's errors, the file and what is wrong with it."""
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def say(line: str) -> None:
+    """Print a line on stderr, if that can still be written to: the terminal may have been closed."""
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
+
+
+def read_options(
+    options: type[OptionsT], command_line: Sequence[str] | None, prog: str, description: str | None = None
+) -> OptionsT:
+    """Read the options of a command.
+
+    Args:
+        options: A dataclass, or a union of such for commands with subcommands.
+        command_line: The arguments; None: those of the process.
+        prog: Name of the program.
+        description: What it does; by default the docstring of `options`.
+
+    Raises:
+        ValueError: If an option is unknown or its value is not what is expected.
+        SystemExit: If help was asked for.
+    """
+    import tyro
+
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            parsed: Any = tyro.cli(
+                options, args=command_line, prog=called(prog), description=description,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )  # fmt: skip
+    except SystemExit as leaving:
+        if leaving.code in (0, None):
+            raise
+        raise ValueError(_one_line(said.getvalue())) from None
+    return parsed
+
+
+_BOX: Final = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]")
+
+
+def _one_line(box: str) -> str:
+    """Return in one line what tyro says in a box: what is wrong, and what it expects."""
+    rows = [_BOX.sub("", row).strip() for row in box.splitlines()][1:]
+    sections = [part.split("\n") for part in re.split(r"\n─+\n", "\n".join(row for row in rows if row))]
+    wrong = " ".join(sections[0]).removeprefix("Error parsing ")
+    if "xpected" in wrong:
+        return re.sub(r"^(--[\w-]+): ", r"\1 ", wrong[0].lower() + wrong[1:])
+    known = [row for part in sections[1:-1] for row in part[1:] if row.startswith("-")]
+    return f"{wrong[0].lower()}{wrong[1:]}, expected {' or '.join(known) or 'what --help lists'}"
