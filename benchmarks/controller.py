@@ -22,8 +22,9 @@ import numpy as np
 import torch
 import tyro
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from benchmarks.timing import milliseconds
 from mujoban_controller import train
@@ -212,7 +213,8 @@ class RandomDrive:
     def play(self, steps: int) -> dict[str, float]:
         """Play, until a signal asks to stop; return numbers of looks with something wrong, highest speeds in m/s."""
         world, rng, report = self.world, self._rng, self.report
-        with StopSignal() as stop, tqdm(total=steps, unit="step") as bar:
+        with StopSignal() as stop, Progress(console=Console(stderr=True)) as bar:
+            task = bar.add_task("steps", total=steps)
             while report["random_steps"] < steps and not stop.requested:
                 drawn = rng.uniform(-1.0, 1.0, self._torque.shape).astype(np.float32)
                 renewed = rng.random(world.batch) < 0.05
@@ -224,7 +226,7 @@ class RandomDrive:
                 if self._ticks % _LOOK_EVERY == 0:
                     self._check()
                 report["random_steps"] += world.batch
-                bar.update(world.batch)
+                bar.advance(task, world.batch)
                 over = np.flatnonzero(world.done)
                 report["episodes"] += len(over)
                 if over.size:

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 import tyro
-from tqdm import tqdm
+from rich.console import Console
+from rich.progress import Progress
 
 from bringup.rollout import ticks
 from mujoban_core.sense_plan_act import SensePlanAct
@@ -50,7 +51,8 @@ def run(options: Options | None = None) -> dict[str, Any]:
     durations: dict[GoalKind, list[int]] = {kind: [] for kind in GoalKind}
     begun, kind = np.zeros((2, batch), np.int64)
     start = time.perf_counter()
-    with tqdm(total=len(episodes), disable=None) as progress:
+    with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task("episodes", total=len(episodes))
         for tick in ticks(policy, world, episodes):
             rows, termination = tick.rows, tick.decision.termination
             issued += int(tick.decision.issued.sum())
@@ -65,7 +67,7 @@ def run(options: Options | None = None) -> dict[str, Any]:
                 lengths.append(int(tick.step[m]) + 1)
                 if not tick.solved[m]:
                     unsolved.append(episodes[tick.episode[m]].seed)
-                progress.update()
+                progress.advance(task)
     return {
         "episodes": len(solved),
         "success_rate": float(np.mean(solved)),

@@ -16,7 +16,7 @@ from bringup.command import Stack, import_from_here
 from bringup.options import HERE, ClusterOptions, Count, EpisodeOptions, FilePath, ModuleOptions
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_file
-from mujoban_core.program import read_options, run_command
+from mujoban_core.program import called, read_options, run_command
 from mujoban_core.threads import set_threads
 from mujoban_sim.presets import DEFAULT_WORLD
 
@@ -89,7 +89,7 @@ def evaluate(
 
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = read_options(Options, command_line, PROG, __doc__)
+    options = read_options(Options, command_line, called(PROG), __doc__)
     check_file("--json", options.json)
     import_from_here()
     from bringup.reporting import Reporting

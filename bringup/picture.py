@@ -5,7 +5,7 @@ Run as ``python -m bringup.picture docs/images/world.png --seed 5``; the episode
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -16,14 +16,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mujoban_core.camera import FRAME_SIZE
+from mujoban_core.files import check_file
 from mujoban_core.interfaces import Observation, module_seeds
+from mujoban_core.program import read_options, run_command
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.presets import DEFAULT_WORLD
-from mujoban_sim.rendering import RenderingError
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import generate_level
+
+PROG = "bringup.picture"
 
 _SIZE = 480
 """Rows of the picture in pixels; frames are drawn twice as large and scaled down."""
@@ -92,16 +95,14 @@ def _compose(above: NDArray[np.uint8], views: list[NDArray[np.uint8]]) -> Image.
     return picture
 
 
-def main(args: list[str] | None = None) -> None:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Draw the picture that the command line asks for."""
-    try:
-        config = tyro.cli(Picture, args=args, description=__doc__)
-        config.path.parent.mkdir(parents=True, exist_ok=True)
-        draw_picture(config).save(config.path, optimize=True)
-    except (RenderingError, ValueError, OSError) as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    config = read_options(Picture, command_line, PROG, __doc__)
+    config.path.parent.mkdir(parents=True, exist_ok=True)
+    check_file("PATH", config.path)
+    draw_picture(config).save(config.path, optimize=True)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    run_command(PROG, main)

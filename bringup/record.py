@@ -31,7 +31,7 @@ from mujoban_core import children
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_folder
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_core.program import read_options, run_command
+from mujoban_core.program import called, read_options, run_command
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.signals import StopSignal, interrupt_status, interruptible, leave
 from mujoban_core.threads import set_threads
@@ -277,7 +277,7 @@ def gather(answers: Sequence[Connection], on_end: Callable[[int], None]) -> int:
 
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = read_options(Options, command_line, PROG, __doc__)
+    options = read_options(Options, command_line, called(PROG), __doc__)
     import_from_here()
     check_folder("--out", options.out)
     seed = recorded_seed(options.seed, records=True, allow_test_seeds=options.allow_test_seeds)

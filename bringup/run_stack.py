@@ -12,7 +12,7 @@ from tyro.conf import arg
 from bringup.command import import_from_here, recorded_seed
 from bringup.options import SPEED, Count, EpisodeOptions, FilePath, FolderPath, ModuleOptions
 from mujoban_core.files import check_file, check_folder
-from mujoban_core.program import read_options, run_command
+from mujoban_core.program import called, read_options, run_command
 
 if TYPE_CHECKING:
     from bringup.monitor import MonitorNode
@@ -49,7 +49,7 @@ class Options:
 
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = read_options(Options, command_line, PROG)
+    options = read_options(Options, command_line, called(PROG))
     play, stack = options.play, options.modules.stack(options.play.body)
     import_from_here()
     seed = recorded_seed(play.seed, records=options.record is not None, allow_test_seeds=options.allow_test_seeds)

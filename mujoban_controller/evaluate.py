@@ -8,14 +8,12 @@ with the scripted driver or a privileged teacher under the same judgement, which
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import torch
-import tyro
 
 from mujoban_controller import SHIPPED
 from mujoban_controller.controller import VisuomotorController
@@ -23,12 +21,15 @@ from mujoban_controller.drivers import Driver, PrivilegedDriver
 from mujoban_controller.judge import judge
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
-from mujoban_core.files import write_atomically
+from mujoban_core.files import check_file, write_atomically
 from mujoban_core.interfaces import Controller
+from mujoban_core.program import read_options, run_command
 from mujoban_rl.weights import digest, load_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range
+
+PROG = "mujoban_controller.evaluate"
 
 
 @dataclass(frozen=True)
@@ -83,20 +84,17 @@ def _check_body(config: Mapping[str, object], options: Options) -> None:
         raise ValueError(f"--body {options.body}: the weights are of the body {config['body']}")
 
 
-def main() -> int:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    try:
-        options = tyro.cli(Options)
-        torch.set_num_threads(options.threads)
-        driver, identity = make_driver(options)
-        report = judge(
-            driver, OraclePlanner(), episodes=options.episodes, first_seed=options.seed,
-            difficulty=options.difficulty, body=options.body, world=options.world, batch=options.batch,
-            threads=options.threads, plans=options.instructions == "plans",
-        )  # fmt: skip
-    except (ValueError, OSError) as error:
-        print(f"mujoban_controller.evaluate: error: {error}", file=sys.stderr)
-        return 2
+    options = read_options(Options, command_line, PROG, __doc__)
+    check_file("--json", options.json)
+    torch.set_num_threads(options.threads)
+    driver, identity = make_driver(options)
+    report = judge(
+        driver, OraclePlanner(), episodes=options.episodes, first_seed=options.seed, difficulty=options.difficulty,
+        body=options.body, world=options.world, batch=options.batch, threads=options.threads,
+        plans=options.instructions == "plans",
+    )  # fmt: skip
     told = {"weights": identity, "world": options.world, "episodes": options.episodes, "seed": options.seed}
     text = json.dumps({**report, **told}, indent=2)
     if options.json is None:
@@ -107,4 +105,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(PROG, main)

@@ -10,7 +10,6 @@ Give the directory again to resume a run.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,10 +31,13 @@ from mujoban_controller.play import Draw, ExploringPlayer, Player, PrivilegedPla
 from mujoban_controller.ppo import PPOLearner, PPOTrainingConfig, RolloutSource
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.product import Validation
+from mujoban_core.program import read_options, run_command
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import digest, load_weights, provenance
 from mujoban_sim.oracles import OraclePlanner
+
+PROG = "mujoban_controller.train"
 
 PLANNER_NODES = 20_000
 """Search nodes for the plans that the goal task follows; levels that need more are played at random."""
@@ -226,17 +228,13 @@ def make_trainer(options: Options) -> Trainer[Any]:
     return Trainer(directory, learner, source, budget, cadence, record=record)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
     """Run the command."""
-    try:
-        options = tyro.cli(Options, args=arguments, prog="mujoban_controller.train", description=__doc__)
-        torch.set_num_threads(options.threads)
-        make_trainer(options).run(limit_seconds=options.seconds)
-    except (ValueError, OSError) as error:
-        print(f"mujoban_controller.train: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    options = read_options(Options, command_line, prog, __doc__)
+    torch.set_num_threads(options.threads)
+    make_trainer(options).run(limit_seconds=options.seconds)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(PROG, main)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import io
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, suppress
 from pathlib import Path
 from typing import Any, Final, NoReturn, TypeVar
@@ -77,12 +77,15 @@ def say(line: str) -> None:
 
 
 def read_options(
-    options: type[OptionsT], command_line: Sequence[str] | None, prog: str, description: str | None = None
+    options: type[OptionsT] | Mapping[str, type[OptionsT]],
+    command_line: Sequence[str] | None,
+    prog: str,
+    description: str | None = None,
 ) -> OptionsT:
     """Read the options of a command.
 
     Args:
-        options: A dataclass, or a union of such for commands with subcommands.
+        options: A dataclass; or, for commands with subcommands, theirs by name.
         command_line: The arguments; None: those of the process.
         prog: Name of the program.
         description: What it does; by default the docstring of `options`.
@@ -96,15 +99,15 @@ def read_options(
     said = io.StringIO()
     try:
         with redirect_stderr(said):
-            parsed: Any = tyro.cli(
-                options, args=command_line, prog=called(prog), description=description,
+            read: Any = tyro.extras.subcommand_cli_from_dict if isinstance(options, Mapping) else tyro.cli
+            return read(
+                options, args=command_line, prog=prog, description=description,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )  # fmt: skip
     except SystemExit as leaving:
         if leaving.code in (0, None):
             raise
         raise ValueError(_one_line(said.getvalue())) from None
-    return parsed
 
 
 _BOX: Final = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]")
@@ -117,5 +120,7 @@ def _one_line(box: str) -> str:
     wrong = " ".join(sections[0]).removeprefix("Error parsing ")
     if "xpected" in wrong:
         return re.sub(r"^(--[\w-]+): ", r"\1 ", wrong[0].lower() + wrong[1:])
+    if missing := re.match(r".*[Mm]issing from .*?: (--\S+)", wrong):
+        return f"{missing[1]} is missing, expected it with a value"
     known = [row for part in sections[1:-1] for row in part[1:] if row.startswith("-")]
     return f"{wrong[0].lower()}{wrong[1:]}, expected {' or '.join(known) or 'what --help lists'}"

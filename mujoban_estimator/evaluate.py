@@ -6,18 +6,18 @@ Both see what was recorded, the instructions and terminations included, whatever
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_core.files import check_file, write_atomically
 from mujoban_core.interfaces import INSTRUCTION_LIMIT, renew_rows
+from mujoban_core.program import read_options, run_command
 from mujoban_estimator import SHIPPED, SHIPPED_TERMINATION, load, load_termination
 from mujoban_estimator.bag_stream import TOPICS, stretches
 from mujoban_estimator.data import Batch, Batcher, Stretch, choose_windows
@@ -26,6 +26,8 @@ from mujoban_estimator.estimator import Belief, StateEstimator, probabilities
 from mujoban_estimator.metrics import MapScores, TerminationScores
 from mujoban_estimator.termination import ControlTermination
 from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
+
+PROG = "mujoban_estimator.evaluate"
 
 _LENGTH = 480
 _STREAMS = 8
@@ -145,24 +147,22 @@ class Options:
     """Write the report there instead of printing it."""
 
 
-def main() -> None:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = tyro.cli(Options, prog="mujoban_estimator.evaluate", description=__doc__)
+    options = read_options(Options, command_line, PROG, __doc__)
+    check_file("--json", options.json)
     torch.set_num_threads(options.threads)
-    try:
-        result = evaluate(
-            load(options.estimator, options.device), load_termination(options.termination, options.device),
-            find_bags(options.bags), max_ticks=options.max_ticks, skip_damaged=options.skip_damaged,
-        )  # fmt: skip
-    except (ValueError, OSError) as error:
-        print(f"evaluate: error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+    result = evaluate(
+        load(options.estimator, options.device), load_termination(options.termination, options.device),
+        find_bags(options.bags), max_ticks=options.max_ticks, skip_damaged=options.skip_damaged,
+    )  # fmt: skip
     text = json.dumps({k: None if v != v else round(v, 5) for k, v in result.items()}, indent=2)
     if options.json is None:
         print(text)
     else:
-        options.json.write_text(text + "\n")
+        write_atomically(options.json, (text + "\n").encode())
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    run_command(PROG, main)

@@ -7,7 +7,7 @@ A run that is started again with the same directory goes on where it stopped.
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -15,6 +15,7 @@ from typing import Annotated
 import torch
 import tyro
 
+from mujoban_core.program import read_options, run_command
 from mujoban_estimator.bag_source import BagSource, Reading
 from mujoban_estimator.bag_stream import TOPICS
 from mujoban_estimator.data import Batch
@@ -23,6 +24,8 @@ from mujoban_msgs_py.bags.training import find_bags, open_training_bag, require_
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import provenance
+
+PROG = "mujoban_estimator.train"
 
 
 @dataclass(frozen=True)
@@ -93,15 +96,12 @@ def make_trainer(options: Options) -> Trainer[Batch]:
     )
 
 
-def main() -> None:
+def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
     """Run the command."""
-    try:
-        options = tyro.cli(Options, prog="mujoban_estimator.train", description=__doc__)
-        make_trainer(options).run(limit_seconds=options.seconds)
-    except (ValueError, OSError) as error:
-        print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+    options = read_options(Options, command_line, prog, __doc__)
+    make_trainer(options).run(limit_seconds=options.seconds)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    run_command(PROG, main)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +13,11 @@ import tyro
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+
+from mujoban_core.files import check_file
+from mujoban_core.program import read_options, reason, run_command
+
+PROG = "mujoban_planner.curves"
 
 
 @dataclass(frozen=True)
@@ -42,14 +47,14 @@ def read_curve(run: Path, difficulty: int) -> list[tuple[float, float, float]]:
     return [(line["step"], line["cpu_seconds"], line[key]) for line in lines if key in line]
 
 
-def main() -> None:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command line."""
-    options = tyro.cli(Options)
+    options = read_options(Options, command_line, PROG, __doc__)
+    check_file("--out", options.out)
     try:
         curves = {run.name: read_curve(run, options.difficulty) for run in options.runs}
     except OSError as error:
-        print(f"curves: {error}; expected run directories of a trainer", file=sys.stderr)
-        sys.exit(2)
+        raise ValueError(f"{reason(error)}, expected run directories of a trainer") from error
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
     for name, curve in curves.items():
         for axis, column, scale in ((axes[0], 0, 1e3), (axes[1], 1, 60.0)):
@@ -62,7 +67,8 @@ def main() -> None:
     axes[0].legend()
     figure.tight_layout()
     figure.savefig(options.out, dpi=110)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    run_command(PROG, main)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import tyro
 
+from mujoban_core.files import check_file, write_atomically
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.program import read_options, run_command
 from mujoban_core.stats import wilson_interval
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import MOVE_LIMIT
@@ -25,6 +26,8 @@ from mujoban_rl.weights import digest
 from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_batch, seed_range
 from mujoban_sokoban.levels import LevelBatch, read_levels, stack_levels
 from mujoban_sokoban.solver import Status, solve_batch
+
+PROG = "mujoban_planner.evaluate"
 
 _CHUNK = 1024
 """Levels played at once."""
@@ -122,17 +125,14 @@ def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> d
     return result
 
 
-def main() -> None:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command line."""
-    options = tyro.cli(Options)
+    options = read_options(Options, command_line, PROG, __doc__)
+    check_file("--json", options.json)
     torch.set_num_threads(options.threads)
-    try:
-        levels = options.level_batch()
-        planner = load(options.weights, options.device)
-        result = evaluate(planner, levels, options)
-    except (ValueError, OSError) as error:
-        print(f"evaluate: {error}", file=sys.stderr)
-        sys.exit(2)
+    levels = options.level_batch()
+    planner = load(options.weights, options.device)
+    result = evaluate(planner, levels, options)
     low, high = result["solve_interval"]
     print(f"solve_rate            {result['solve_rate']:.4f}  [{low:.4f}, {high:.4f}]  n = {result['episodes']}")
     if "moves_over_optimal" in result:
@@ -141,8 +141,9 @@ def main() -> None:
     if options.look_ahead:
         print(f"evaluations per level {result['evaluations_per_level']:.1f}  (at most {options.expansions} per search)")
     if options.json is not None:
-        options.json.write_text(json.dumps(result, indent=2) + "\n")
+        write_atomically(options.json, (json.dumps(result, indent=2) + "\n").encode())
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    run_command(PROG, main)

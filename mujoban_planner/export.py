@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,11 +20,14 @@ from torch import Tensor, nn
 
 from mujoban_core.files import write_atomically
 from mujoban_core.grid import CHANNELS, GRID_SIZE
+from mujoban_core.program import read_options, run_command
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.compiled import DIGEST, INPUTS, OUTPUTS, graph_path
 from mujoban_planner.heads import INSTRUCTIONS, INTERIOR, Weighed
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_rl.weights import WeightsError, digest, read_record, record_path
+from mujoban_rl.weights import digest, read_record, record_path
+
+PROG = "mujoban_planner.export"
 
 
 @dataclass(frozen=True)
@@ -90,17 +92,16 @@ def _strip(parts: Iterable[Any]) -> None:
         part.doc_string = None
 
 
-def main() -> int:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Export, and say where the graph is."""
-    options = tyro.cli(Options, description=__doc__)
+    options = read_options(Options, command_line, PROG, __doc__)
     try:
         path = export(options.weights)
-    except (WeightsError, ModuleNotFoundError) as error:
-        print(f"export: error: {error}", file=sys.stderr)
-        return 2
+    except ModuleNotFoundError as error:
+        raise ValueError(str(error)) from error
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(PROG, main)

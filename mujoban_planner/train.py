@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import sys
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +11,7 @@ from typing import Annotated
 import torch
 import tyro
 
+from mujoban_core.program import read_options, run_command
 from mujoban_planner import load
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.imitation import ImitationConfig, imitation
@@ -19,9 +21,11 @@ from mujoban_planner.reinforcement import MPOConfig, reinforcement
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
 
+PROG = "mujoban_planner.train"
+
 
 @dataclass(frozen=True)
-class _Command:
+class _Command(ABC):
     """What all trainings have in common."""
 
     seconds: float | None = None
@@ -32,6 +36,10 @@ class _Command:
     """Seconds between checkpoints."""
     threads: int = 1
     """Threads of the network on a CPU."""
+
+    @abstractmethod
+    def main(self) -> None:
+        """Train."""
 
     def cadence(self, *, log_updates: int = 100, publish_updates: int = 10) -> Cadence:
         """Return how often the run logs, publishes, evaluates and saves."""
@@ -133,23 +141,20 @@ class MPOPushes(_ActorCommand):
         push_mpo(self.config, self.run, self.cadence(), self.actors).run(limit_seconds=self.seconds)
 
 
-def main() -> None:
+def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
     """Run the command line."""
-    commands = {
+    commands: dict[str, type[_Command]] = {
         "imitation": Imitation,
         "expert-iteration": ExpertIteration,
         "ppo": PPO,
         "mpo": MPO,
         "mpo-pushes": MPOPushes,
     }
-    command = tyro.extras.subcommand_cli_from_dict(commands)
+    command = read_options(commands, command_line, prog, __doc__)
     torch.set_num_threads(command.threads)
-    try:
-        command.main()
-    except (ValueError, OSError) as error:
-        print(f"train: error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+    command.main()
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    run_command(PROG, main)

@@ -5,13 +5,15 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 import imageio.v2 as imageio
 import pytest
 
-from bringup import evaluate, run_stack
+from bringup import evaluate, record, run_stack, train
 from bringup.command import recorded_seed
 from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
@@ -140,6 +142,35 @@ def test_a_report_goes_through_a_device_and_never_replaces_it(tmp_path, capfd):
 def test_a_wrong_option_is_one_line_that_tells_what_is_expected(capfd, options, said):
     assert run(run_stack, *options) == 2
     assert capfd.readouterr().err == f"command: error: {said}\n"
+
+
+@pytest.mark.parametrize(
+    ("module", "needed"),
+    [("controller", ["--run", "runs/x"]), ("planner", ["imitation"]), ("estimator", ["--bags", "bags/x"])],
+)
+def test_one_command_trains_each_module_and_names_what_it_does_not_know(capfd, module, needed):
+    assert run(train, module, *needed, "--bogus") == 2
+    err = capfd.readouterr().err
+    assert err.startswith("command: error: unrecognized options: --bogus") and err.count("\n") == 1
+    assert run(train, module, "--help") == 0
+    assert f"usage: train.py {module}" in capfd.readouterr().out
+
+
+def test_what_cannot_be_trained_is_one_line(capfd):
+    assert run(train, "oracle") == 2
+    assert capfd.readouterr().err == "command: error: module oracle, expected controller|planner|estimator\n"
+
+
+def test_the_installed_commands_are_the_programs():
+    scripts = tomllib.loads((Path(run_stack.__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
+    for name in ("mujoban-run", "mujoban-evaluate", "mujoban-record", "mujoban-train"):
+        module, function = scripts[name].split(":")
+        assert callable(getattr(import_module(module), function))
+
+
+def test_an_option_that_must_be_given_is_named(capfd):
+    assert run(record, "--episodes", "3") == 2
+    assert capfd.readouterr().err == "command: error: --out is missing, expected it with a value\n"
 
 
 def test_a_missing_gpu_is_one_line(capfd):

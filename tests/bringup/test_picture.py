@@ -1,8 +1,11 @@
+from functools import partial
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from bringup.picture import main
+from mujoban_core.program import exit_status
 
 
 def test_the_picture_shows_the_world_from_above_and_four_views_of_the_robot(tmp_path):
@@ -19,9 +22,7 @@ def test_the_picture_shows_the_world_from_above_and_four_views_of_the_robot(tmp_
 
 @pytest.mark.parametrize("argument", [["--seed", "-1"], ["--difficulty", "9"], ["--steps", "1"]])
 def test_a_bad_argument_is_named_in_one_line(tmp_path, capsys, argument):
-    with pytest.raises(SystemExit) as stop:
-        main([str(tmp_path / "world.png"), *argument])
-    assert stop.value.code == 2
+    assert exit_status("picture", partial(main, [str(tmp_path / "world.png"), *argument])) == 2
     message = capsys.readouterr().err.strip()
     assert argument[0].strip("-") in message
     assert argument[1] in message

@@ -1,10 +1,11 @@
 import json
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
+from mujoban_core.program import exit_status
 from mujoban_planner import evaluate
 from mujoban_planner.boards import abstract_states, bit_boards, take_levels
 from mujoban_planner.lookahead import LookAheadPlanner, look_ahead
@@ -151,15 +152,14 @@ def test_only_the_learned_planner_can_look_ahead(planner):
         look_ahead(planner, -1)
 
 
-def _run(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["evaluate", *map(str, arguments)])
-    evaluate.main()
+def _run(*arguments):
+    return exit_status("evaluate", partial(evaluate.main, [str(a) for a in arguments]))
 
 
-def test_evaluate_reports_rate_interval_and_optimality(tmp_path, monkeypatch, capsys):
+def test_evaluate_reports_rate_interval_and_optimality(tmp_path, capsys):
     path, out = tmp_path / "levels.txt", tmp_path / "out.json"
     write_levels(path, [generate_level(1, seed) for seed in range(12)])
-    _run(monkeypatch, "--levels", path, "--json", out)
+    assert _run("--levels", path, "--json", out) == 0
     result = json.loads(out.read_text())
     assert result["episodes"] == 12
     low, high = result["solve_interval"]
@@ -172,8 +172,6 @@ def test_evaluate_reports_rate_interval_and_optimality(tmp_path, monkeypatch, ca
     "arguments",
     [("--difficulty", 6), ("--levels", "missing.txt"), ("--weights", "missing.safetensors"), ("--seed", 10**7)],
 )
-def test_bad_input_ends_evaluate_with_one_line_and_status_2(arguments, monkeypatch, capsys):
-    with pytest.raises(SystemExit) as exit_:
-        _run(monkeypatch, "--episodes", 3, *arguments)
-    assert exit_.value.code == 2
+def test_bad_input_ends_evaluate_with_one_line_and_status_2(arguments, capsys):
+    assert _run("--episodes", 3, *arguments) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1

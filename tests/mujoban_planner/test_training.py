@@ -1,6 +1,6 @@
 import json
 import math
-import sys
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +12,7 @@ from bringup.command import Choice, Stack
 from bringup.record import Job, MixedEpisodes, record
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
 from mujoban_core.plugins import ROLES
+from mujoban_core.program import exit_status
 from mujoban_msgs_py.bags import BagError
 from mujoban_msgs_py.bags.training import EpisodeTick
 from mujoban_msgs_py.conversions import InstructionReading
@@ -223,13 +224,11 @@ def test_mpo_refuses_bags_with_levels_that_are_kept_for_tests(tmp_path):
         bag_transitions.BagTransitions.read([tmp_path])
 
 
-def test_bad_training_input_ends_with_one_line_and_status_2(tmp_path, monkeypatch, capsys):
+def test_bad_training_input_ends_with_one_line_and_status_2(tmp_path, capsys):
     _imitate(tmp_path, 32)
     capsys.readouterr()
-    monkeypatch.setattr(sys, "argv", ["train", "imitation", "--run", str(tmp_path), "--channels", "16"])
-    with pytest.raises(SystemExit) as exit_:
-        train.main()
-    assert exit_.value.code == 2
+    arguments = ["imitation", "--run", str(tmp_path), "--channels", "16"]
+    assert exit_status("train", partial(train.main, arguments)) == 2
     error = capsys.readouterr().err.strip()
     assert "another configuration" in error and len(error.splitlines()) == 1
 
