@@ -2,12 +2,14 @@ import copy
 import json
 import os
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
 import mujoban_planner
+from mujoban_core.program import exit_status
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.compiled import graph_path
 from mujoban_planner.decision import count_visits, initial_means, initial_visits
@@ -123,9 +125,8 @@ def test_an_export_takes_the_place_of_a_damaged_graph(small, recwarn):
     assert not [w for w in recwarn if "other weights" in str(w.message)]
 
 
-def test_export_of_missing_weights_is_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["export", str(tmp_path / "none.safetensors")])
-    assert main() == 2
+def test_export_of_missing_weights_is_one_line(tmp_path, capsys):
+    assert exit_status("export", partial(main, [str(tmp_path / "none.safetensors")])) == 2
     error = capsys.readouterr().err
     assert error.startswith("export: error: ") and "none" in error and error.count("\n") == 1
 
