@@ -34,7 +34,7 @@ class RewardConfig:
     progress: float = 5.0
     """Of the potential's change."""
     lane: float = 0.3
-    """Weight, in the potential, of the robot's distance from the lane of its push."""
+    """Weight, in the potential, of the robot's distance from its lane."""
     gap: float = 0.5
     """Weight, in the potential, of the distance between robot and box."""
     aside: float = 4.0
@@ -61,7 +61,8 @@ def potential(world: GoalView, config: RewardConfig) -> NDArray[np.float64]:
     direction = OFFSETS_XY[goals.direction]
     normal = np.stack([-direction[:, 1], direction[:, 0]], 1)
     robot = world.pose[:, :2].astype(np.float64)
-    move = -np.hypot(*(goals.robot_target - robot).T) / size
+    to_go = (goals.robot_target - robot) / size
+    move = -np.hypot(*to_go.T) - config.lane * np.abs((to_go * normal).sum(1))
     box = world.box_position[rows, goals.box_index]
     left = (goals.box_target - rest_position(world)) / size
     apart = (box - robot) / size

@@ -37,9 +37,11 @@ class GoalTaskConfig:
     """Instructions that fail in a row before the episode is given up, since a jammed box stays jammed."""
     misaligned: float = 0.5
     """Share of episodes that begin with robot and boxes off the centres of their cells."""
-    robot_offset: float = 0.29
+    robot_offset: float = 0.25
+    """Largest such offset of a robot in cells; towards a free cell it is up to half a cell, where a robot that left its
+    lane is held up by a peg. A policy that has not begun there presses on."""
     box_offset: float = 0.1
-    """Largest such offsets in cells, along one axis; across it they are less than half of that."""
+    """Largest such offset of a box, along one axis; across it it is less than half of that."""
     overshoot: float = 0.11
     """Cells past its target at which a pushed box fails the instruction at once, as does one that has come to rest
     past it: it cannot be pulled back. Saves the time that a policy that still learns would spend there."""

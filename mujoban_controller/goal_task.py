@@ -24,7 +24,7 @@ from mujoban_controller.goal_features import feature_layout, goal_offsets, privi
 from mujoban_controller.goal_rewards import GoalReward, fallen
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.instructions import TerminationNoise, feasible_kinds, random_instruction
-from mujoban_core.grid import DIFFICULTIES, INSTRUCTION_LIMIT, Instruction
+from mujoban_core.grid import DIFFICULTIES, INSTRUCTION_LIMIT, OFFSETS_RC, OFFSETS_XY, Instruction
 from mujoban_core.interfaces import ControllerInput, Planner, put_rows, take_rows
 from mujoban_rl.engine import State
 from mujoban_sim.driving import forward_speed
@@ -335,12 +335,23 @@ class GoalTask:
         config, rng, world = self.config, self._rng, self.world
         size, m, k = world.body.cell_size, len(rows), world.max_boxes
         pose = world.pose[rows].astype(np.float64)
-        # What is off along both axes would overlap a peg.
-        lopsided = np.where(rng.random((m, k + 1, 1)) < 0.5, [[1.0, 0.4]], [[0.4, 1.0]])
-        offset = rng.uniform(-1, 1, (m, k + 1, 2)) * lopsided * size
-        pose[:, :2] += offset[:, 0] * config.robot_offset
-        boxes = world.box_position[rows] + offset[:, 1:] * config.box_offset
+        pose[:, :2] += self._stray(rows) * size
+        # A box that is off along both axes would overlap a peg.
+        lopsided = np.where(rng.random((m, k, 1)) < 0.5, [[1.0, 0.4]], [[0.4, 1.0]])
+        boxes = world.box_position[rows] + rng.uniform(-1, 1, (m, k, 2)) * lopsided * config.box_offset * size
         world.place(rows, pose, boxes)
+
+    def _stray(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return offsets of robots from the centres of their cells, in cells, [M, 2]: up to halfway to a free cell."""
+        config, rng, world = self.config, self._rng, self.world
+        heading = rng.integers(1, len(OFFSETS_XY), len(rows))
+        cell = world.agent_cell[rows] + OFFSETS_RC[heading]
+        boxed = (world.box_cell[rows] == cell[:, None]).all(-1).any(-1)
+        free = ~world.wall[rows, cell[:, 0], cell[:, 1]] & ~boxed
+        along = rng.uniform(0.0, np.where(free, 0.5, config.robot_offset))[:, None]
+        across = rng.uniform(-config.robot_offset, config.robot_offset, (len(rows), 1))
+        axis = OFFSETS_XY[heading]
+        return along * axis + across * np.stack([-axis[:, 1], axis[:, 0]], 1)
 
     def _issue(self, rows: NDArray[np.int64]) -> None:
         world = self.world

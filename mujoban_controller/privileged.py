@@ -19,7 +19,7 @@ from mujoban_controller.goal_features import feature_layout
 from mujoban_core.bodies import get_body
 
 _CLIP = 5.0
-_LEAST_SCALE, _LARGEST_SCALE = 0.08, 1.6
+_LEAST_SCALE, _LARGEST_SCALE = 0.15, 1.6
 
 
 class Normaliser(nn.Module):
