@@ -24,10 +24,12 @@ class Condition(NamedTuple):
 
 
 def report_on(node: Node, look: Callable[[], Condition]) -> None:
-    """Have a node publish, every `PERIOD`, the condition that `look` returns."""
+    """Have a node publish, every `PERIOD` in which somebody listens, the condition that `look` returns."""
     publisher = node.create_publisher(DiagnosticArray, TOPIC, 10)
 
     def publish() -> None:
+        if publisher.get_subscription_count() == 0:
+            return
         condition = look()
         status = DiagnosticStatus(
             level=DiagnosticStatus.WARN if condition.warning else DiagnosticStatus.OK,
