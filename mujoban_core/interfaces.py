@@ -275,8 +275,8 @@ class Planner(Module):
         due = terminated | (state.instruction < 0)
         rows, others = np.flatnonzero(due), np.flatnonzero(~due)
         if self.thinks and others.size:
-            thoughts = self.think(abstract_state[others], take_rows(state.memory, others))
-            state = state._replace(memory=put_rows(state.memory, others, thoughts))
+            memory = self.think(abstract_state[others], take_rows(state.memory, others))
+            state = state._replace(memory=put_rows(state.memory, others, memory))
         if rows.size == 0:
             return state.instruction, state
         decision, memory = self.decide(abstract_state[rows], take_rows(state.memory, rows))

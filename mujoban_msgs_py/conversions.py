@@ -4,8 +4,7 @@ A function `x_to_msg` makes a message and `x_from_msg` reads one. Both check wha
 size and values that are not finite raise `ConversionError`, so that nothing bad enters the graph or leaves it.
 The readers take what rclpy delivers and what `rosbags` deserialises alike. Round trips are exact.
 
-Array fields are filled with `array.array`: the setters of ROS messages are about 1,000 times slower with anything
-else. Scalars become Python scalars: a NumPy scalar in a message is silently corrupted.
+Array fields are filled with `array.array`: all else is 1,000 times slower. Scalars are Python's: NumPy's get corrupted.
 """
 
 from __future__ import annotations
@@ -385,15 +384,13 @@ def _check_probability(what: str, values: NDArray[np.float32]) -> None:
 
 
 def _probability(value: float) -> float:
-    probability = float(value)
-    if not 0.0 <= probability <= 1.0:
+    if not 0.0 <= (probability := float(value)) <= 1.0:
         raise ConversionError(f"probability must lie in [0, 1], got {probability}")
     return probability
 
 
 def _direction(value: int) -> int:
-    direction = int(value)
-    if not 0 <= direction < len(Direction):
+    if not 0 <= (direction := int(value)) < len(Direction):
         names = ", ".join(f"{d.value} ({d.name})" for d in Direction)
         raise ConversionError(f"direction must be one of {names}, got {direction}")
     return direction

@@ -38,7 +38,7 @@ class PushOutput(NamedTuple):
 class PushPolicy(nn.Module):
     """The push head of a planner network as policy, and a critic that reads the same features.
 
-    The other heads get no gradient. Those that would have a say in the planner's decision are muted, so that it goes
+    The other heads get no gradient. Those that would have a say in the planner's decision are masked, so that it goes
     by the push head alone.
     """
 
@@ -47,7 +47,7 @@ class PushPolicy(nn.Module):
 
         Args:
             planner: Network; changed in place.
-            untaught: Whether nothing was learned so far: mute what will never be taught.
+            untaught: Whether nothing was learned so far: mask what will never be taught.
 
         Raises:
             ValueError: If the network has no propagation, without which its decisions do not follow the push head.

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from mujoban_core.bodies import FIRST_PERSON_CAMERA, Body
 from mujoban_core.camera import FRAME_SIZE, in_view
 from mujoban_core.grid import GRID_SIZE, cell_to_xy
+from mujoban_core.worker import Worker
 from mujoban_sim.appearance import (
     BOX_COLOUR,
     BOX_ON_TARGET_COLOUR,
@@ -29,7 +30,6 @@ from mujoban_sim.appearance import (
 from mujoban_sim.presets import WorldPreset
 from mujoban_sim.render_scene import TOP_DOWN_CAMERA, UNSEEN_GROUP, RenderScene, build_scene, write_level
 from mujoban_sim.scene import BOX_HALF_EXTENT
-from mujoban_sim.worker import Worker
 from mujoban_sokoban.levels import Level
 
 CameraName = Literal["first_person", "top_down"]

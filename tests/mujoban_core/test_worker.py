@@ -7,7 +7,7 @@ from concurrent.futures import thread as pools
 
 import pytest
 
-from mujoban_sim.worker import Worker
+from mujoban_core.worker import Worker
 
 
 def test_jobs_run_in_one_other_thread_in_their_order():
@@ -42,7 +42,7 @@ def test_a_finalizer_can_end_a_worker_while_a_pool_is_being_used():
 
 def test_what_was_submitted_is_finished_before_the_interpreter_ends():
     code = (
-        "import time; from mujoban_sim.worker import Worker; w = Worker('w');"
+        "import time; from mujoban_core.worker import Worker; w = Worker('w');"
         " w.submit(lambda: (time.sleep(0.3), print('finished', flush=True)))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "finished\n"
