@@ -9,7 +9,7 @@ from std_msgs.msg import String
 from benchmarks.malformed import TARGETS, Vandal
 from bringup.graph_recorder import RecorderNode
 from bringup.viz import VizNode
-from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py import conversions, listening, topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_sokoban.episodes import Episodes
 
@@ -82,6 +82,7 @@ def test_an_end_that_the_simulator_did_not_announce_is_taken_back_when_the_tick_
 
 
 def test_messages_that_are_no_messages_are_named_by_topic(play_graph, capfd):
+    listening._logger.cache_clear()  # what a test before this one was told is not held back here
     graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
     publisher = graph.tap.create_publisher(topics.INSTRUCTION.type, topics.INSTRUCTION.name, topics.INSTRUCTION.qos)
     listeners = 5  # simulator, termination, controller, monitor and the test's tap
