@@ -82,7 +82,8 @@ class MonitorNode(Node):
         qos = live_qos(depth=1024)
         listen(self, topics.TRUE_EPISODE, self._on_episode, qos=qos, decode=checked(topics.TRUE_EPISODE))
         for topic in _WATCHED:
-            listen(self, topic, partial(self._receive, topic.name), qos=qos)
+            steady = topic == topics.TRUE_ABSTRACT_STATE
+            listen(self, topic, partial(self._receive, topic.name), qos=qos, steady=steady)
         self.watch = PublisherWatch(self)
 
     @property

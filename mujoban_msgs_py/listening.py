@@ -19,7 +19,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from mujoban_msgs_py.decoders import DECODERS, Decode
-from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.raw import Steady, raw_stamp, read
 from mujoban_msgs_py.topics import PUBLISHERS, Topic
 
 LOG_PERIOD: Final = 5.0
@@ -50,6 +50,7 @@ def listen(
     *,
     qos: QoSProfile | None = None,
     decode: Decode | None = None,
+    steady: bool = False,
 ) -> Subscription:
     """Subscribe to a topic of the graph.
 
@@ -59,16 +60,19 @@ def listen(
         receive: Called with every message that is sound.
         qos: The topic's own by default.
         decode: Reads a message, in place of the topic's reader; a ValueError drops it.
+        steady: Whether the topic says the same for many ticks, and its reader leaves the header out (see `Steady`).
     """
     reader = DECODERS[topic] if decode is None else decode
+    repeated = Steady(topic.type, reader) if steady else None
 
     def on_message(message: bytes) -> None:
         try:
-            received = Received(raw_stamp(message), read(message, topic.type, reader), message)
+            stamp = raw_stamp(message)
+            content = read(message, topic.type, reader) if repeated is None else repeated(message)
         except ValueError as error:
             reject(node, topic.name, error)
             return
-        receive(received)
+        receive(Received(stamp, content, message))
 
     return node.create_subscription(topic.type, topic.name, on_message, qos or topic.qos, raw=True)
 
