@@ -52,6 +52,14 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "does not see.",
         "estimator",
     ),
+    "PrivilegedPolicy": Purpose(
+        "Privileged teacher of the controller",
+        "Drives a body to carry out instructions, as an oracle and as the teacher of a camera policy; learned from the "
+        "goal task's rewards alone (paper C.3).",
+        "The robot's pose and velocity, the boxes' positions, proprioception and the instruction: ground truth.",
+        "Not for a robot that has only a camera. Made for the world that its record names.",
+        "controller",
+    ),
     "ResidualPlanner": Purpose(
         "Planner",
         "Turns an estimate of the abstract state into the next instruction (paper C.2).",
