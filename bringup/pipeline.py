@@ -70,8 +70,7 @@ def digest_tree(path: Path) -> str:
         if path.is_dir():
             total.update(file.relative_to(path).as_posix().encode() + b"\0")
         with file.open("rb") as stream:
-            for block in iter(lambda: stream.read(1 << 20), b""):
-                total.update(block)
+            hashlib.file_digest(stream, lambda: total)
     return total.hexdigest()
 
 
