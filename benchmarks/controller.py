@@ -28,7 +28,8 @@ from torch import Tensor, nn
 
 from benchmarks.timing import milliseconds
 from mujoban_controller import train
-from mujoban_controller.controller import Gaussian, VisuomotorController, gaussian, gaussian_layers
+from mujoban_controller.controller import VisuomotorController, gaussian, gaussian_layers
+from mujoban_controller.policy import Gaussian
 from mujoban_controller.train import TrainConfig, make_trainer
 from mujoban_core.grid import GRID_SIZE, xy_to_cell
 from mujoban_core.interfaces import ControllerInput

@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mujoban_controller.controller import Recurrent, VisuomotorController
+from mujoban_controller.controller import INPUT_FIELDS, MEMORY_FIELDS, Recurrent, VisuomotorController
 from mujoban_controller.goal_features import feature_layout, privileged_features, side_ahead
 from mujoban_controller.goal_rewards import GoalReward
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import LOOK_AGAIN
 from mujoban_controller.goal_view import StoredView
-from mujoban_controller.play import INPUT_FIELDS, MEMORY_FIELDS, Fields
+from mujoban_controller.play import Fields
 from mujoban_core.bodies import Body, get_body
 from mujoban_core.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMIT, WALL
 from mujoban_msgs_py import topics

@@ -16,7 +16,7 @@ Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_controller.drivers import ControllerDriver, Driver
+from mujoban_controller.policy import Gaussian, GoalPolicy
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE, CameraMount, project
 from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
@@ -34,20 +36,12 @@ MIN_SCALE = 1e-3
 """Smallest standard deviation of a torque."""
 INITIAL_SCALE = 0.5
 """Standard deviation of every torque before training."""
+INPUT_FIELDS = ("frame", "proprio", "instruction", "terminated")
+"""What the controller sees, as recorded windows name it."""
+MEMORY_FIELDS = ("memory0", "memory1", "memory2")
+"""Its memory before a tick, `Recurrent`."""
 _CLIP = 5.0
 _TRACK = 7
-
-
-class Gaussian(NamedTuple):
-    """A diagonal normal distribution over torques."""
-
-    mean: Tensor
-    scale: Tensor
-
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        """Return one draw, not limited to [-1, 1]."""
-        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
-        return self.mean + self.scale * noise
 
 
 def gaussian_layers(features: int, actions: int) -> tuple[nn.Linear, nn.Linear]:
@@ -74,6 +68,11 @@ class Recurrent(NamedTuple):
     """LSTM cell, [B, H]."""
     track: Tensor
     """Dead reckoning, [B, 7]; see `dead_reckoning`."""
+
+
+def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
+    """Return the memory with which the controller went into windows, [M, ...]."""
+    return Recurrent(*(batch[name][:, 0] for name in MEMORY_FIELDS))
 
 
 def dead_reckoning(track: Tensor, velocity: Tensor, heading: Tensor, terminated: Tensor, period: float) -> Tensor:
@@ -152,12 +151,14 @@ def rows_of_sky(mount: CameraMount, multiple: int) -> int:
     return max(int(level) // multiple * multiple, 0)
 
 
-class VisuomotorController(nn.Module, Controller):
+class VisuomotorController(GoalPolicy, Controller):
     """The learned controller of paper C.3; sees o_cam, o_pr, A and beta and nothing else.
 
     As a `Controller` it is deterministic: the mean torque, limited to [-1, 1].
     """
 
+    file_name = "controller"
+    acts_ahead = False
     proprio_mean: Tensor
     proprio_scale: Tensor
     axes: Tensor
@@ -218,6 +219,11 @@ class VisuomotorController(nn.Module, Controller):
         """Take mean and deviation of proprioceptive samples, [M, P], for the normalisation of inputs."""
         self.proprio_mean.copy_(proprio.mean(0))
         self.proprio_scale.copy_(proprio.std(0).clamp(min=1e-2))
+
+    def normalise(self, batch: Mapping[str, Tensor]) -> None:
+        """Fit the normalisation to the first windows [M, W, ...] that are finite, once."""
+        if not self.fitted and bool(torch.isfinite(batch["proprio"]).all()):
+            self.fit_normalisation(batch["proprio"].flatten(0, 1))
 
     def encode(self, frame: Tensor) -> Tensor:
         """Return the ResNet's features [M, F] of frames uint8 [M, 64, 64, 3]."""
@@ -292,6 +298,18 @@ class VisuomotorController(nn.Module, Controller):
             outputs.append(h)
         features = torch.cat([torch.stack(outputs, 1), mixed], -1)
         return ControllerOutput(self.distribution(features), features, Recurrent(h, c, track))
+
+    def over_windows(self, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
+        """Return the distributions in the ticks of windows [M, W, ...] from number `skipped` on, [M, W - n, U].
+
+        The skipped ticks are played too, so that the memory is what these weights make of them.
+        """
+        whole = self(*(batch[name] for name in INPUT_FIELDS), memory_of(batch), batch["first"]).action
+        return Gaussian(whole.mean[:, skipped:], whole.scale[:, skipped:])
+
+    def driver(self) -> Driver:
+        """Return a driver by the mean torques, with a memory of its own."""
+        return ControllerDriver(self)
 
     def distribution(self, features: Tensor) -> Gaussian:
         """Return the distribution over torques given `ControllerOutput.features`."""

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.controller import ControllerOutput, VisuomotorController
+from mujoban_controller.controller import INPUT_FIELDS, ControllerOutput, VisuomotorController, memory_of
 from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask
-from mujoban_controller.play import INPUT_FIELDS, Batch, CameraPlayer, Fields, memory_of
+from mujoban_controller.play import Batch, CameraPlayer, Fields
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
@@ -181,7 +181,7 @@ class DistilLearner(ProductLearner[Batch]):
         """Train `student` in place; `generator` draws the jitter of colours."""
         super().__init__(validation or Validation())
         self.student, self.config, self._generator = student, config, generator
-        self.head = GoalHead(student.hidden + student.config["features"])  # pyright: ignore[reportArgumentType]
+        self.head = GoalHead(student.hidden + student.config["features"])
         self._average = moving_average(student, config.average, warm_up=True)
         parameters = [*student.parameters(), *self.head.parameters()]
         self._adam = torch.optim.Adam(parameters, config.learning_rate, foreach=True)
@@ -190,9 +190,7 @@ class DistilLearner(ProductLearner[Batch]):
     @property
     def product(self) -> VisuomotorController:
         """The moving average of the student."""
-        module = self._average.module
-        assert isinstance(module, VisuomotorController)
-        return module
+        return self._average.module
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -219,9 +217,8 @@ class DistilLearner(ProductLearner[Batch]):
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one gradient step."""
         student, config = self.student, self.config
-        if not student.fitted and bool(torch.isfinite(batch["proprio"]).all()):
-            for policy in (student, self.product):
-                policy.fit_normalisation(batch["proprio"].flatten(0, 1))
+        for policy in (student, self.product):
+            policy.normalise(batch)
         frame = jitter_colours(batch["frame"], config.jitter, self._generator)
         inputs = (batch[name] for name in INPUT_FIELDS if name != "frame")
         output = student(frame, *inputs, memory_of(batch), batch["first"])

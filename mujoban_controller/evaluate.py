@@ -8,7 +8,7 @@ with the scripted driver or a privileged teacher under the same judgement, which
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,12 +17,11 @@ import torch
 
 from mujoban_controller import SHIPPED
 from mujoban_controller.controller import VisuomotorController
-from mujoban_controller.drivers import Driver, PrivilegedDriver
+from mujoban_controller.drivers import Driver
 from mujoban_controller.judge import judge
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
 from mujoban_core.files import check_file, write_atomically
-from mujoban_core.interfaces import Controller
 from mujoban_core.program import read_options, run_command
 from mujoban_rl.weights import digest, load_weights
 from mujoban_sim.oracles import OraclePlanner
@@ -65,23 +64,16 @@ class Options:
             raise ValueError("--driver teacher: expected --weights of a privileged policy")
 
 
-def make_driver(options: Options) -> tuple[Driver | Controller, str]:
+def make_driver(options: Options) -> tuple[Driver, str]:
     """Return the driver and what identifies it: the digest of its weights, or its name."""
     if options.driver == "scripted":
         return scripted_driver, "scripted"
-    if options.driver == "teacher" and options.weights is not None:
-        policy = load_weights(PrivilegedPolicy, options.weights, options.device)
-        _check_body(policy.config, options)
-        return PrivilegedDriver(policy), digest(options.weights)
+    cls = PrivilegedPolicy if options.driver == "teacher" else VisuomotorController
     weights = options.weights or SHIPPED
-    controller = load_weights(VisuomotorController, weights, options.device)
-    _check_body(controller.config, options)
-    return controller, digest(weights)
-
-
-def _check_body(config: Mapping[str, object], options: Options) -> None:
-    if config["body"] != options.body:
-        raise ValueError(f"--body {options.body}: the weights are of the body {config['body']}")
+    policy = load_weights(cls, weights, options.device)
+    if policy.config["body"] != options.body:
+        raise ValueError(f"--body {options.body}: the weights are of the body {policy.config['body']}")
+    return policy.driver(), digest(weights)
 
 
 def main(command_line: Sequence[str] | None = None) -> int:

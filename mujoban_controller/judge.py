@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from mujoban_controller.drivers import ControllerDriver, Driver
+from mujoban_controller.drivers import Driver
 from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_settings import judging_config
 from mujoban_controller.goal_task import EpisodeEnd, GoalTask, Outcome
 from mujoban_core.grid import Instruction
-from mujoban_core.interfaces import Controller, Planner
+from mujoban_core.interfaces import Planner
 from mujoban_core.stats import wilson_interval
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -94,7 +94,7 @@ class OutcomeSummary:
 
 
 def judge(
-    driver: Driver | Controller,
+    driver: Driver,
     planner: Planner,
     *,
     episodes: int,
@@ -109,7 +109,7 @@ def judge(
     """Play episodes with a planner's instructions, or random ones, and exact termination signals.
 
     Args:
-        driver: A controller, learned or privileged, or anything else that drives.
+        driver: What drives, see `mujoban_controller.drivers`.
         planner: Gives the instructions from true abstract states.
         episodes: Levels to play, with seeds `first_seed`, `first_seed` + 1, ...
         first_seed: Seed of the first level.
@@ -131,11 +131,10 @@ def judge(
         SeededEpisodes(difficulty, first_seed), np.random.default_rng(first_seed), threads=threads,
     )  # fmt: skip
     last_seed = first_seed + episodes
-    drive = ControllerDriver(driver) if isinstance(driver, Controller) else driver
     summary, ended, lost, last_failure = OutcomeSummary(), list[EpisodeEnd](), dict[str, str](), dict[int, str]()
     seeds = np.array([spec.seed for spec in task.world.episodes if spec is not None])
     while len(ended) < episodes:
-        result = task.step(drive(task))
+        result = task.step(driver(task))
         counted = [o for o in result.outcomes if seeds[o.row] < last_seed]
         summary.add(counted)
         last_failure |= {o.row: failure_name(o) for o in counted if not o.completed}

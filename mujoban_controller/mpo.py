@@ -16,10 +16,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.controller import Gaussian, VisuomotorController
 from mujoban_controller.goal_features import feature_layout
-from mujoban_controller.play import INPUT_FIELDS, Batch, memory_of
-from mujoban_controller.privileged import Critic, PrivilegedPolicy
+from mujoban_controller.play import Batch
+from mujoban_controller.policy import Gaussian, GoalPolicy
+from mujoban_controller.privileged import Critic
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.bodies import get_body
 from mujoban_rl.engine import Scalars, State
@@ -28,8 +28,6 @@ from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
 from mujoban_rl.losses.returns import td_target
 from mujoban_rl.optimise import guarded_step
-
-Policy = PrivilegedPolicy | VisuomotorController
 
 
 @dataclass(frozen=True)
@@ -76,20 +74,12 @@ class MPOTrainingConfig:
             raise ValueError(f"window {self.window}: expected more ticks than n_step {self.n_step}")
 
 
-def policy_over(policy: Policy, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
-    """Return the policy's distributions in the ticks of windows from number `skipped` on, [M, W - n, U]."""
-    if isinstance(policy, PrivilegedPolicy):
-        return policy(batch["features"][:, skipped:])
-    whole = policy(*(batch[k] for k in INPUT_FIELDS), memory_of(batch), batch["first"]).action
-    return Gaussian(whole.mean[:, skipped:], whole.scale[:, skipped:])
-
-
 class MPOLearner(ProductLearner[Batch]):
     """Online and target networks, and dual variables."""
 
     def __init__(
         self,
-        policy: Policy,
+        policy: GoalPolicy,
         body: str,
         config: MPOTrainingConfig,
         generator: torch.Generator,
@@ -108,7 +98,7 @@ class MPOLearner(ProductLearner[Batch]):
         self._updates = 0
 
     @property
-    def product(self) -> Policy:
+    def product(self) -> GoalPolicy:
         """The online policy."""
         return self.policy
 
@@ -142,7 +132,7 @@ class MPOLearner(ProductLearner[Batch]):
         """Take one step of the critic, and one of the policy unless the batch was refused."""
         config = self.config
         with torch.no_grad():
-            target = policy_over(self.target_policy, batch, config.n_step)
+            target = self.target_policy.over_windows(batch, config.n_step)
             noise = torch.randn((config.samples, *target.mean.shape), generator=self._generator)
             # Shapes [N, M, W - n, U] and [N, M, W - n].
             action = target.mean + target.scale * noise
@@ -164,17 +154,12 @@ class MPOLearner(ProductLearner[Batch]):
         """Take in what is seen, for online and target networks alike: what they compute would differ otherwise."""
         self.critic.normaliser.update(batch["features"][:, 0])
         self.target_critic.normaliser.load_state_dict(self.critic.normaliser.state_dict())
-        policy, target = self.policy, self.target_policy
-        if isinstance(policy, PrivilegedPolicy) and isinstance(target, PrivilegedPolicy):
-            policy.normaliser.update(batch["features"][:, 0])
-            target.normaliser.load_state_dict(policy.normaliser.state_dict())
-        for camera in (policy, target):
-            if isinstance(camera, VisuomotorController) and not camera.fitted:
-                camera.fit_normalisation(batch["proprio"].flatten(0, 1))
+        for policy in (self.policy, self.target_policy):
+            policy.normalise(batch)
 
     def _as_seen(self, action: Tensor, batch: Mapping[str, Tensor]) -> Tensor:
         """Return a policy's actions in the last W - n ticks as the side ahead sees them, [N, M, W - n, U]."""
-        if isinstance(self.policy, PrivilegedPolicy) or len(self._actuators) == 1:
+        if self.policy.acts_ahead or len(self._actuators) == 1:
             return action
         order = self._actuators[batch["side"][:, self.config.n_step :]]
         return action.gather(-1, order.expand(action.shape))
@@ -192,7 +177,7 @@ class MPOLearner(ProductLearner[Batch]):
     def _update_policy(
         self, batch: Batch, target: Gaussian, action: Tensor, q: Tensor, guard: NaNGuard
     ) -> dict[str, float]:
-        online = policy_over(self.policy, batch, self.config.n_step)
+        online = self.policy.over_windows(batch, self.config.n_step)
         loss, stats = self.loss(
             (online.mean.flatten(0, 1), online.scale.flatten(0, 1)),
             (target.mean.flatten(0, 1), target.scale.flatten(0, 1)),

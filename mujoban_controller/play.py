@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_controller.controller import Recurrent, VisuomotorController
+from mujoban_controller.controller import INPUT_FIELDS, MEMORY_FIELDS, Recurrent, VisuomotorController
 from mujoban_controller.goal_task import GoalTask, TaskStep
 from mujoban_controller.judge import OutcomeSummary
 from mujoban_controller.privileged import PrivilegedPolicy
@@ -24,15 +24,6 @@ from mujoban_rl.replay import SequenceBuilder, SequenceReplay
 
 Fields = dict[str, NDArray]
 Batch = dict[str, Tensor]
-MEMORY_FIELDS = ("memory0", "memory1", "memory2")
-"""A camera policy's memory before a tick, `Recurrent`."""
-INPUT_FIELDS = ("frame", "proprio", "instruction", "terminated")
-"""What a camera policy sees."""
-
-
-def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
-    """Return the memory with which a camera policy went into windows, [M, ...]."""
-    return Recurrent(*(batch[name][:, 0] for name in MEMORY_FIELDS))
 
 
 class Player(ABC):
@@ -63,7 +54,7 @@ class PrivilegedPlayer(Player):
     def __init__(self, task: GoalTask, policy: PrivilegedPolicy, generator: torch.Generator) -> None:
         """Play with a copy of `policy` and noise from `generator`."""
         self.task, self._generator = task, generator
-        self._policy = PrivilegedPolicy(**policy.config)  # pyright: ignore[reportArgumentType]
+        self._policy = PrivilegedPolicy(**policy.config)
         self._features: NDArray[np.float32] = task.features()
 
     @torch.no_grad()
@@ -98,7 +89,7 @@ class CameraPlayer(Player):
     def __init__(self, task: GoalTask, policy: VisuomotorController, generator: torch.Generator) -> None:
         """Play with a copy of `policy` and randomness from `generator`."""
         self.task, self.generator = task, generator
-        self._policy = VisuomotorController(**policy.config)  # pyright: ignore[reportArgumentType]
+        self._policy = VisuomotorController(**policy.config)
         self._policy.mixed_precision = policy.mixed_precision
         self._memory: Memory = self._policy.initial_memory(task.world.batch)
 

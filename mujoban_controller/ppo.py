@@ -17,10 +17,10 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
-from mujoban_controller.controller import Gaussian
 from mujoban_controller.goal_features import Mirror, feature_layout
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.judge import OutcomeSummary
+from mujoban_controller.policy import Gaussian
 from mujoban_controller.privileged import PrivilegedPolicy, Value
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.bodies import get_body

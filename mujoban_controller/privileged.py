@@ -8,15 +8,23 @@ Shapes: D features, U actuators, M samples; `...` any leading axes, such as samp
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.controller import Gaussian
+from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import feature_layout
+from mujoban_controller.policy import Gaussian, GoalPolicy
 from mujoban_core.bodies import get_body
+
+if TYPE_CHECKING:
+    from mujoban_controller.goal_task import GoalTask
 
 _CLIP = 5.0
 _LEAST_SCALE, _LARGEST_SCALE = 0.15, 1.6
@@ -64,8 +72,11 @@ def _layers(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-class PrivilegedPolicy(nn.Module):
+class PrivilegedPolicy(GoalPolicy):
     """Policy over torques, as the side ahead sees them, from privileged features; the teacher of the camera policy."""
+
+    file_name = "teacher"
+    acts_ahead = True
 
     def __init__(self, body: str = "ball", width: int = 128, scale: float = 0.4) -> None:
         """Build the network.
@@ -88,6 +99,23 @@ class PrivilegedPolicy(nn.Module):
         mean = self.layers(self.normaliser(features))
         scale = self.log_scale.clamp(math.log(_LEAST_SCALE), math.log(_LARGEST_SCALE)).exp()
         return Gaussian(mean, scale.expand_as(mean))
+
+    def over_windows(self, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
+        """Return the distributions in the ticks of windows [M, W, ...] from number `skipped` on, [M, W - n, U]."""
+        return self(batch["features"][:, skipped:])
+
+    def normalise(self, batch: Mapping[str, Tensor]) -> None:
+        """Take in the first ticks of windows [M, W, ...]."""
+        self.normaliser.update(batch["features"][:, 0])
+
+    def driver(self) -> Driver:
+        """Return a driver by the mean torques."""
+        return self._drive
+
+    @torch.inference_mode()
+    def _drive(self, task: GoalTask) -> NDArray[np.float32]:
+        action = self(torch.from_numpy(task.features())).mean.clamp(-1.0, 1.0)
+        return task.torque_of(action.numpy())
 
 
 class Value(nn.Module):

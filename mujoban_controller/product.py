@@ -9,11 +9,8 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-from mujoban_controller.controller import VisuomotorController
-from mujoban_controller.drivers import Driver, PrivilegedDriver
 from mujoban_controller.judge import judge
-from mujoban_controller.privileged import PrivilegedPolicy
-from mujoban_core.interfaces import Controller
+from mujoban_controller.policy import GoalPolicy
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
@@ -22,7 +19,6 @@ from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import VALIDATION_SEEDS
 
 BatchT = TypeVar("BatchT")
-Product = VisuomotorController | PrivilegedPolicy
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ class ProductLearner(Learner[BatchT]):
 
     @property
     @abstractmethod
-    def product(self) -> Product:
+    def product(self) -> GoalPolicy:
         """The network that the run is for, as it is now."""
 
     @abstractmethod
@@ -81,10 +77,9 @@ class ProductLearner(Learner[BatchT]):
             return {}
         training = product.training
         product.eval()
-        driver: Driver | Controller = PrivilegedDriver(product) if isinstance(product, PrivilegedPolicy) else product
         report = judge(
-            driver, OraclePlanner(), episodes=where.episodes, first_seed=VALIDATION_SEEDS.start, body=where.body,
-            difficulty=where.difficulty, world=where.world, batch=128, threads=where.threads,
+            product.driver(), OraclePlanner(), episodes=where.episodes, first_seed=VALIDATION_SEEDS.start,
+            body=where.body, difficulty=where.difficulty, world=where.world, batch=128, threads=where.threads,
         )  # fmt: skip
         product.train(training)
         feasible = report["instructions"]["feasible"]
@@ -99,10 +94,9 @@ class ProductLearner(Learner[BatchT]):
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the best product, or the present one where none was judged."""
         product = self.product
-        name = "teacher" if isinstance(product, PrivilegedPolicy) else "controller"
-        chosen = type(product)(**product.config)  # pyright: ignore[reportArgumentType]
+        chosen = type(product)(**product.config)
         chosen.load_state_dict(self._best_weights or product.state_dict())
         score = self._best_score
         best = None if score is None else {"solved": score[0], "feasible": score[1]}
-        path = directory.path / f"{name}.safetensors"
+        path = directory.path / f"{product.file_name}.safetensors"
         save_weights(path, chosen, product.config, {**record, "validation": best})

@@ -22,7 +22,6 @@ import tyro
 from mujoban_controller.bag_ticks import BagTicks
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.distil import DistilConfig, DistilLearner, DistilPlayer
-from mujoban_controller.drivers import PrivilegedDriver
 from mujoban_controller.episodes import TrainingEpisodes
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import GoalTask
@@ -168,7 +167,7 @@ class _Parts:
     def _distil(self) -> tuple[Learner[Any], Source[Any]]:
         config, student = self.config, self._camera()
         assert config.teacher is not None
-        teacher = PrivilegedDriver(load_weights(PrivilegedPolicy, config.teacher))
+        teacher = load_weights(PrivilegedPolicy, config.teacher).driver()
         learner = DistilLearner(student, config.distil, self.generator(), self.validation)
         player = DistilPlayer(self.task, student, teacher, config.distil, self.generator())
         return learner, self._replay(player, config.distil)

@@ -124,9 +124,7 @@ class ImitationLearner(Learner[Batch]):
     @property
     def average(self) -> LearnedPlanner:
         """The moving average."""
-        module = self._average.module
-        assert isinstance(module, LearnedPlanner)
-        return module
+        return self._average.module
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:

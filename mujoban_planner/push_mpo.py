@@ -87,7 +87,6 @@ class PushMPOLearner(Learner[Window]):
     @property
     def target(self) -> PushPolicy:
         """The averaged policy with its critic."""
-        assert isinstance(self._average.module, PushPolicy)
         return self._average.module
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from typing import Generic, TypeVar
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -14,6 +15,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from mujoban_rl.limits import NaNGuard
 
 Weights = tuple[Tensor, ...] | list[Tensor]
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 def guarded_step(
@@ -81,7 +83,13 @@ def warm_up_cosine(warm_up: float) -> Callable[[float], float]:
     return factor
 
 
-def moving_average(module: nn.Module, decay: float, *, warm_up: bool = False) -> AveragedModel:
+class MovingAverage(AveragedModel, Generic[ModuleT]):
+    """An average of a module's weights, which is of the module's class."""
+
+    module: ModuleT
+
+
+def moving_average(module: ModuleT, decay: float, *, warm_up: bool = False) -> MovingAverage[ModuleT]:
     """Return an exponential moving average of a module's weights; `update_parameters` after every step.
 
     Args:
@@ -95,4 +103,5 @@ def moving_average(module: nn.Module, decay: float, *, warm_up: bool = False) ->
         get_ema_multi_avg_fn(min(decay, (1 + n) / (10 + n)))(average, current, steps)
 
     averaging = warming if warm_up else get_ema_multi_avg_fn(decay)
-    return AveragedModel(module, multi_avg_fn=averaging, use_buffers=False).eval()
+    average: MovingAverage[ModuleT] = MovingAverage(module, multi_avg_fn=averaging, use_buffers=False)
+    return average.eval()

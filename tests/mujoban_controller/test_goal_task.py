@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from mujoban_controller.drivers import ControllerDriver
 from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_features import feature_layout
 from mujoban_controller.goal_settings import GoalTaskConfig, judging_config
@@ -159,7 +160,7 @@ def test_random_instructions_judge_every_kind():
 
 
 def test_controllers_and_drivers_are_judged_alike():
-    report = judge(OracleController(), OraclePlanner(), episodes=2, first_seed=7, difficulty=1)
+    report = judge(ControllerDriver(OracleController()), OraclePlanner(), episodes=2, first_seed=7, difficulty=1)
     assert report["success_rate"] == 1.0
 
 

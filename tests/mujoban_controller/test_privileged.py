@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from mujoban_controller.drivers import PrivilegedDriver
 from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_features import feature_layout
 from mujoban_controller.goal_settings import judging_config
@@ -37,7 +36,7 @@ def make(body, batch=3):
 def test_as_a_controller_it_does_what_it_does_in_the_goal_task(name):
     task, policy = make(name), wild_policy(name)
     controller = PrivilegedController(policy)
-    driver, memory = PrivilegedDriver(policy), controller.initial_memory(3)
+    driver, memory = policy.driver(), controller.initial_memory(3)
     rows, before = np.arange(3), task.world.box_position.copy()
     for _ in range(130):
         memory = renew_rows(memory, controller.initial_memory(3), task.first)

@@ -1,0 +1,52 @@
+"""What a policy of the goal task is to those that train and judge it, whatever it sees.
+
+Shapes: M windows of a batch, W ticks of a window, n ticks that are skipped, U actuators.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from mujoban_controller.drivers import Driver
+
+
+class Gaussian(NamedTuple):
+    """A diagonal normal distribution over torques."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+        """Return one draw, not limited to [-1, 1]."""
+        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
+        return self.mean + self.scale * noise
+
+
+class GoalPolicy(nn.Module, ABC):
+    """A policy over torques that learns in the goal task."""
+
+    file_name: ClassVar[str]
+    """Of the weights that a run exports, without the ending."""
+    acts_ahead: ClassVar[bool]
+    """Whether its actions are as the side ahead sees them; else they are the body's torques."""
+    config: dict[str, Any]
+    """Arguments that build it."""
+    action_size: int
+    """U."""
+
+    @abstractmethod
+    def over_windows(self, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
+        """Return the distributions in the ticks of windows [M, W, ...] from number `skipped` on, [M, W - n, U]."""
+
+    @abstractmethod
+    def normalise(self, batch: Mapping[str, Tensor]) -> None:
+        """Fit the normalisation of inputs to windows [M, W, ...], as far as it is not fitted already."""
+
+    @abstractmethod
+    def driver(self) -> Driver:
+        """Return what drives the robots of a goal task by the mean torques, limited to [-1, 1]."""
