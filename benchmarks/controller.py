@@ -28,8 +28,7 @@ from torch import Tensor, nn
 
 from benchmarks.timing import milliseconds
 from mujoban_controller import train
-from mujoban_controller.controller import VisuomotorController, gaussian, gaussian_layers
-from mujoban_controller.policy import Gaussian
+from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.train import TrainConfig, make_trainer
 from mujoban_core.grid import GRID_SIZE, xy_to_cell
 from mujoban_core.interfaces import ControllerInput
@@ -38,6 +37,7 @@ from mujoban_rl.engine import Learner, Source
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
 from mujoban_rl.losses.returns import td_target
+from mujoban_rl.networks import Gaussian, gaussian, gaussian_layers
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import generate_level

@@ -15,7 +15,6 @@ Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -26,37 +25,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_controller.drivers import ControllerDriver, Driver
-from mujoban_controller.policy import Gaussian, GoalPolicy
+from mujoban_controller.policy import GoalPolicy
 from mujoban_core.bodies import get_body
-from mujoban_core.camera import FRAME_SIZE, CameraMount, project
+from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
+from mujoban_rl.networks import Gaussian, frame_encoder, gaussian, gaussian_layers, rows_of_sky
 
-MIN_SCALE = 1e-3
-"""Smallest standard deviation of a torque."""
-INITIAL_SCALE = 0.5
-"""Standard deviation of every torque before training."""
 INPUT_FIELDS = ("frame", "proprio", "instruction", "terminated")
 """What the controller sees, as recorded windows name it."""
 MEMORY_FIELDS = ("memory0", "memory1", "memory2")
 """Its memory before a tick, `Recurrent`."""
 _CLIP = 5.0
 _TRACK = 7
-
-
-def gaussian_layers(features: int, actions: int) -> tuple[nn.Linear, nn.Linear]:
-    """Return the layers for mean and scale, which begin close to zero and to `INITIAL_SCALE`."""
-    layers = nn.Linear(features, actions), nn.Linear(features, actions)
-    for layer in layers:
-        nn.init.uniform_(layer.weight, -1e-3, 1e-3)
-        nn.init.zeros_(layer.bias)
-    return layers
-
-
-def gaussian(mean: Tensor, raw_scale: Tensor) -> Gaussian:
-    """Return the distribution given the outputs of `gaussian_layers`, [..., U] each."""
-    scale = INITIAL_SCALE * functional.softplus(raw_scale + math.log(math.expm1(1.0)))
-    return Gaussian(mean, scale + MIN_SCALE)
 
 
 class Recurrent(NamedTuple):
@@ -110,45 +91,6 @@ class ControllerOutput(NamedTuple):
     """What the action rests on, [B, T, H + F]; auxiliary losses attach here."""
     memory: Recurrent
     """Memory after the last tick."""
-
-
-class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions beside a strided 1x1 one (He et al. 2016), without normalisation."""
-
-    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
-        super().__init__()
-        self.first = nn.Conv2d(inputs, outputs, 3, stride, 1)
-        self.second = nn.Conv2d(outputs, outputs, 3, 1, 1)
-        self.shortcut = nn.Conv2d(inputs, outputs, 1, stride)
-        with torch.no_grad():
-            self.second.weight.mul_(0.5)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map [B, C, H, W] to [B, C', H / stride, W / stride]."""
-        return functional.relu(self.shortcut(x) + self.second(functional.relu(self.first(x))))
-
-
-def frame_encoder(channels: Sequence[int], features: int, rows: int) -> nn.Sequential:
-    """Return the ResNet from frames [B, 3, rows, 64] to features [B, F]; the last block keeps its resolution."""
-    stem, *widths = channels
-    layers: list[nn.Module] = [nn.Conv2d(3, stem, 4, 2, 1), nn.ReLU()]
-    shrink, width = 2, stem
-    for i, outputs in enumerate(widths):
-        stride = 1 if i == len(widths) - 1 else 2
-        layers.append(ResidualBlock(width, outputs, stride))
-        shrink, width = shrink * stride, outputs
-    flat = width * (rows // shrink) * (FRAME_SIZE // shrink)
-    layers += [nn.Flatten(), nn.Linear(flat, features), nn.LayerNorm(features), nn.ReLU()]
-    return nn.Sequential(*layers)
-
-
-def rows_of_sky(mount: CameraMount, multiple: int) -> int:
-    """Return how many rows at the top of a frame can be left out: those above the horizon, rounded down.
-
-    Heading, which the skyline shows, is in proprioception; the rest of what matters is on the floor.
-    """
-    level = project([[1e6, 0.0, mount.height]], np.zeros(3), mount).pixels[0, 1]
-    return max(int(level) // multiple * multiple, 0)
 
 
 class VisuomotorController(GoalPolicy, Controller):

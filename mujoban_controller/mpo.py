@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from mujoban_controller.goal_features import feature_layout
 from mujoban_controller.play import Batch
-from mujoban_controller.policy import Gaussian, GoalPolicy
+from mujoban_controller.policy import GoalPolicy
 from mujoban_controller.privileged import Critic
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.bodies import get_body
@@ -27,6 +27,7 @@ from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
 from mujoban_rl.losses.returns import td_target
+from mujoban_rl.networks import Gaussian
 from mujoban_rl.optimise import guarded_step
 
 

@@ -7,24 +7,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
-import torch
 from torch import Tensor, nn
 
 from mujoban_controller.drivers import Driver
-
-
-class Gaussian(NamedTuple):
-    """A diagonal normal distribution over torques."""
-
-    mean: Tensor
-    scale: Tensor
-
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        """Return one draw, not limited to [-1, 1]."""
-        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
-        return self.mean + self.scale * noise
+from mujoban_rl.networks import Gaussian
 
 
 class GoalPolicy(nn.Module, ABC):

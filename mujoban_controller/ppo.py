@@ -20,13 +20,13 @@ from torch.distributions import Independent, Normal
 from mujoban_controller.goal_features import Mirror, feature_layout
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.judge import OutcomeSummary
-from mujoban_controller.policy import Gaussian
 from mujoban_controller.privileged import PrivilegedPolicy, Value
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.bodies import get_body
 from mujoban_rl.engine import Scalars, Source, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.ppo import PPOConfig, generalised_advantages, ppo_loss
+from mujoban_rl.networks import Gaussian
 from mujoban_rl.optimise import guarded_step
 
 

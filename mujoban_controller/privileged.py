@@ -20,45 +20,14 @@ from torch.nn import functional
 
 from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import feature_layout
-from mujoban_controller.policy import Gaussian, GoalPolicy
+from mujoban_controller.policy import GoalPolicy
 from mujoban_core.bodies import get_body
+from mujoban_rl.networks import Gaussian, Normaliser
 
 if TYPE_CHECKING:
     from mujoban_controller.goal_task import GoalTask
 
-_CLIP = 5.0
 _LEAST_SCALE, _LARGEST_SCALE = 0.15, 1.6
-
-
-class Normaliser(nn.Module):
-    """Scales features to mean 0 and deviation 1 of the samples that `update` has seen."""
-
-    mean: Tensor
-    variance: Tensor
-    count: Tensor
-
-    def __init__(self, size: int) -> None:
-        """Begin as the identity."""
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("variance", torch.ones(size))
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
-
-    @torch.no_grad()
-    def update(self, features: Tensor) -> None:
-        """Take in samples, [M, D]."""
-        x = features.double()
-        total = self.count + len(x)
-        delta = x.mean(0) - self.mean
-        spread = self.variance * self.count + x.var(0, unbiased=False) * len(x)
-        spread = spread + delta.square() * self.count * len(x) / total
-        self.mean.add_((delta * len(x) / total).float())
-        self.variance.copy_(spread / total)
-        self.count.copy_(total)
-
-    def forward(self, features: Tensor) -> Tensor:
-        """Return normalised features, [..., D]."""
-        return ((features - self.mean) / (self.variance + 1e-4).sqrt()).clamp(-_CLIP, _CLIP)
 
 
 def _layers(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from mujoban_controller.controller import VisuomotorController, dead_reckoning, rows_of_sky
+from mujoban_controller.controller import VisuomotorController, dead_reckoning
 from mujoban_core.bodies import BALL, INERTIAL_SIZE
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
+from mujoban_rl.networks import rows_of_sky
 from mujoban_rl.weights import WeightsError, load_weights, save_weights
 
 SMALL = {"channels": (4, 8, 8), "features": 16, "hidden": 12}

@@ -10,10 +10,11 @@ from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_features import feature_layout
 from mujoban_controller.goal_settings import judging_config
 from mujoban_controller.goal_task import GoalTask
-from mujoban_controller.privileged import Normaliser, PrivilegedPolicy
+from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.privileged_controller import PrivilegedController
 from mujoban_core.bodies import ANT, BALL, BODIES
 from mujoban_core.interfaces import renew_rows
+from mujoban_rl.networks import Normaliser
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.oracles import OraclePlanner
 

@@ -1,0 +1,120 @@
+"""Parts of the networks that see frames or drive motors, which more than one package builds with.
+
+Shape legend: B robots, M samples, D features, U actuators, F features of a frame; `...` any leading axes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mujoban_core.camera import FRAME_SIZE, CameraMount, project
+
+MIN_SCALE: Final = 1e-3
+"""Smallest standard deviation of a torque."""
+INITIAL_SCALE: Final = 0.5
+"""Standard deviation of every torque before training."""
+_CLIP: Final = 5.0
+
+
+class Gaussian(NamedTuple):
+    """A diagonal normal distribution over torques."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+        """Return one draw, not limited to [-1, 1]."""
+        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
+        return self.mean + self.scale * noise
+
+
+def gaussian_layers(features: int, actions: int) -> tuple[nn.Linear, nn.Linear]:
+    """Return the layers for mean and scale, which begin close to zero and to `INITIAL_SCALE`."""
+    layers = nn.Linear(features, actions), nn.Linear(features, actions)
+    for layer in layers:
+        nn.init.uniform_(layer.weight, -1e-3, 1e-3)
+        nn.init.zeros_(layer.bias)
+    return layers
+
+
+def gaussian(mean: Tensor, raw_scale: Tensor) -> Gaussian:
+    """Return the distribution given the outputs of `gaussian_layers`, [..., U] each."""
+    scale = INITIAL_SCALE * functional.softplus(raw_scale + math.log(math.expm1(1.0)))
+    return Gaussian(mean, scale + MIN_SCALE)
+
+
+class Normaliser(nn.Module):
+    """Scales features to mean 0 and deviation 1 of the samples that `update` has seen."""
+
+    mean: Tensor
+    variance: Tensor
+    count: Tensor
+
+    def __init__(self, size: int) -> None:
+        """Begin as the identity."""
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("variance", torch.ones(size))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    @torch.no_grad()
+    def update(self, features: Tensor) -> None:
+        """Take in samples, [M, D]."""
+        x = features.double()
+        total = self.count + len(x)
+        delta = x.mean(0) - self.mean
+        spread = self.variance * self.count + x.var(0, unbiased=False) * len(x)
+        spread = spread + delta.square() * self.count * len(x) / total
+        self.mean.add_((delta * len(x) / total).float())
+        self.variance.copy_(spread / total)
+        self.count.copy_(total)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return normalised features, [..., D]."""
+        return ((features - self.mean) / (self.variance + 1e-4).sqrt()).clamp(-_CLIP, _CLIP)
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions beside a strided 1x1 one (He et al. 2016), without normalisation."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(inputs, outputs, 3, stride, 1)
+        self.second = nn.Conv2d(outputs, outputs, 3, 1, 1)
+        self.shortcut = nn.Conv2d(inputs, outputs, 1, stride)
+        with torch.no_grad():
+            self.second.weight.mul_(0.5)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, C, H, W] to [B, C', H / stride, W / stride]."""
+        return functional.relu(self.shortcut(x) + self.second(functional.relu(self.first(x))))
+
+
+def frame_encoder(channels: Sequence[int], features: int, rows: int) -> nn.Sequential:
+    """Return the ResNet from frames [B, 3, rows, 64] to features [B, F]; the last block keeps its resolution."""
+    stem, *widths = channels
+    layers: list[nn.Module] = [nn.Conv2d(3, stem, 4, 2, 1), nn.ReLU()]
+    shrink, width = 2, stem
+    for i, outputs in enumerate(widths):
+        stride = 1 if i == len(widths) - 1 else 2
+        layers.append(ResidualBlock(width, outputs, stride))
+        shrink, width = shrink * stride, outputs
+    flat = width * (rows // shrink) * (FRAME_SIZE // shrink)
+    layers += [nn.Flatten(), nn.Linear(flat, features), nn.LayerNorm(features), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def rows_of_sky(mount: CameraMount, multiple: int) -> int:
+    """Return how many rows at the top of a frame can be left out: those above the horizon, rounded down.
+
+    Heading, which the skyline shows, is in proprioception; the rest of what matters is on the floor.
+    """
+    level = project([[1e6, 0.0, mount.height]], np.zeros(3), mount).pixels[0, 1]
+    return max(int(level) // multiple * multiple, 0)
