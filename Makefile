@@ -13,7 +13,7 @@ STAMP := .venv/.installed
 INPUTS := pyproject.toml setup.py mujoban_msgs_py/interface_build.py $(wildcard mujoban_msgs_py/msg/*.msg)
 ARGS ?=
 PACKAGES := mujoban_core mujoban_sokoban mujoban_msgs_py mujoban_sim mujoban_rl mujoban_estimator mujoban_planner \
-  mujoban_controller bringup
+  mujoban_controller mujoban_baselines bringup
 
 # CMake's part of ROS, in the versions that go with the wheels of Jazzy.
 COLCON_WHEELS := colcon-common-extensions cmake ninja ros-jazzy-rclpy[fastrtps]==7.1.6 ros-jazzy-common-interfaces==5.3.6 \

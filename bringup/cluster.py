@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
-from bringup.command import Stack
+from bringup.command import Player
 from bringup.options import HERE
 from bringup.results import EpisodeResult
 from mujoban_core.bodies import BALL
@@ -84,7 +84,7 @@ class EveryNth(LazyEpisodes):
 class _Share:
     """What one process of a cluster evaluates."""
 
-    stack: Stack
+    stack: Player
     episodes: EveryNth
     world: str
     batch: int
@@ -93,7 +93,7 @@ class _Share:
 
 
 def evaluate_on_cluster(
-    stack: Stack,
+    stack: Player,
     episodes: Episodes,
     address: str = HERE,
     *,
@@ -110,7 +110,7 @@ def evaluate_on_cluster(
     earlier or later, as with another `batch`: matrix products round differently with others in the batch.
 
     Args:
-        stack: The four modules; weights of one's own must lie on all machines under the same path.
+        stack: The four modules, or an agent; weights of one's own must lie on all machines under the same path.
         episodes: Levels and seeds.
         address: See `spread`.
         num_actors: Number of processes.

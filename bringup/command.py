@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING
 
 from mujoban_core.bodies import BALL
 from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
-from mujoban_core.plugins import LEARNED, ORACLE, PRIVILEGED, ROLES, load_module, shipped_weights
+from mujoban_core.plugins import AGENT, LEARNED, ORACLE, PRIVILEGED, ROLES, load_module, shipped_weights
 
 if TYPE_CHECKING:
+    from mujoban_core.agent import AgentPolicy
     from mujoban_core.interfaces import Module
     from mujoban_core.sense_plan_act import SensePlanAct
 
@@ -108,6 +109,42 @@ class Stack:
     def identities(self) -> dict[str, str]:
         """Return what identifies each module in a report."""
         return {role: choice.identity() for role, choice in self.choices.items()}
+
+
+@dataclass(frozen=True)
+class Solo:
+    """An agent that plays alone, where commands expect a `Stack`."""
+
+    choice: Choice
+    device: str = "cpu"
+    threads: int = 1
+    """Threads of its network."""
+    body: str = BALL.name
+
+    def policy(self) -> AgentPolicy:
+        """Return the agent as a policy.
+
+        Raises:
+            ValueError: If it cannot be loaded or is of another body.
+        """
+        from typing import cast
+
+        from mujoban_core.agent import Agent, AgentPolicy
+
+        agent = cast(Agent, self.choice.load(self.device))
+        check_body(AGENT, agent, self.body)
+        return AgentPolicy(agent)
+
+    def identities(self) -> dict[str, str]:
+        """Return what identifies the agent in a report, and whether it sees what the robot cannot perceive."""
+        identity = self.choice.identity()
+        if self.choice.load().privileged and not identity.endswith(PRIVILEGED):
+            identity += PRIVILEGED
+        return {AGENT: identity}
+
+
+Player = Stack | Solo
+"""What commands play with."""
 
 
 def check_body(role: str, module: Module, body: str) -> None:

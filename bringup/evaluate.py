@@ -1,4 +1,4 @@
-"""Evaluate the stack on many levels in one vectorised rollout: `python bringup/evaluate.py`.
+"""Evaluate the stack, or an agent, on many levels in one vectorised rollout: `python bringup/evaluate.py`.
 
 With `--graph` the same episodes run through the ROS graph, one after the other; with `--cluster` they are shared out
 over the machines of a Ray cluster.
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 from tyro.conf import arg
 
-from bringup.command import Stack, import_from_here
-from bringup.options import HERE, ClusterOptions, Count, EpisodeOptions, FilePath, ModuleOptions
+from bringup.command import Player, Stack, import_from_here
+from bringup.options import HERE, ClusterOptions, Count, EpisodeOptions, FilePath, PlayerOptions
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_file
 from mujoban_core.program import called, read_options, run_command
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from bringup.cluster import EveryNth
     from bringup.reporting import Reporting
     from bringup.results import EpisodeResult
-    from mujoban_core.sense_plan_act import SensePlanAct
+    from bringup.rollout import Policy
     from mujoban_sokoban.episodes import Episodes
 
 PROG = "evaluate.py"
@@ -35,7 +35,7 @@ class Options:
     """Evaluate the stack on many levels in one vectorised rollout; by default on levels for validation."""
 
     play: Annotated[EpisodeOptions, arg(name="")] = field(default_factory=lambda: EpisodeOptions(episodes=256))
-    modules: Annotated[ModuleOptions, arg(name="")] = field(default_factory=ModuleOptions)
+    modules: Annotated[PlayerOptions, arg(name="")] = field(default_factory=PlayerOptions)
     batch: Count = 64
     """Episodes that run at the same time."""
     shared: Annotated[ClusterOptions, arg(name="")] = field(default_factory=ClusterOptions)
@@ -48,10 +48,12 @@ class Options:
         """Reject what contradicts itself."""
         if self.graph and self.shared.cluster:
             raise ValueError("--graph --cluster: expected one of the two, since the graph plays on this machine")
+        if self.graph and self.modules.agent is not None:
+            raise ValueError(f"--agent {self.modules.agent} --graph: expected one of the two")
 
 
 def evaluate(
-    policy: SensePlanAct,
+    policy: Policy,
     episodes: Episodes | EveryNth,
     *,
     body: str = BALL.name,
@@ -64,7 +66,7 @@ def evaluate(
     """Play the episodes in one batched world and return their outcomes.
 
     Args:
-        policy: The four modules.
+        policy: The four modules, or an agent.
         episodes: Levels and seeds.
         body: The robot's body.
         world: The physical world, see `mujoban_sim.presets`.
@@ -97,7 +99,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
 
     play = options.play
     episodes = play.make(VALIDATION_SEEDS.start if play.seed is None else play.seed)
-    stack = options.modules.stack(play.body)
+    stack = options.modules.player(play.body)
     set_threads(stack.threads)
     reporting = Reporting(
         options.json, stack.identities(), len(episodes), generated=play.levels is None, body=play.body, world=play.world
@@ -109,7 +111,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
 
 
 def _play(
-    options: Options, stack: Stack, episodes: Episodes, reporting: Reporting
+    options: Options, stack: Player, episodes: Episodes, reporting: Reporting
 ) -> tuple[Sequence[EpisodeResult], dict[str, Any]]:
     """Play the episodes and return their outcomes, with further entries of the report."""
     from bringup.progress import SolvedBar
@@ -122,7 +124,7 @@ def _play(
             reporting.results = results
             bar.show(results)
 
-        if options.graph:
+        if isinstance(stack, Stack) and options.graph:
             from bringup.stack import PlayOptions
             from bringup.stack import play as play_graph
 

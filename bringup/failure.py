@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bringup.results import EpisodeResult, Failure
-from mujoban_core.grid import AGENT, BOX, OFFSETS_RC, TARGET, WALL, Instruction
-from mujoban_sokoban import rules
+from mujoban_core.grid import AGENT, BOX, OFFSETS_RC, TARGET, WALL
+from mujoban_sokoban.rules import abstract_successor
 from mujoban_sokoban.solver import Status, solve
 
 PROOF_NODES = 50_000
@@ -50,8 +50,10 @@ class EpisodeLog:
         right = estimate_is_right(state, estimate, self._region)
         self._decisions.append(DecisionRecord(state, int(instruction), right, bool(timed_out)))
 
-    def result(self, *, solved: bool, steps: int, episode_return: float) -> EpisodeResult:
-        """Return the outcome of the episode, which has ended."""
+    def result(
+        self, *, solved: bool, steps: int, episode_return: float, last: NDArray[np.float32]
+    ) -> EpisodeResult:
+        """Return the outcome of the episode, which has ended in the true abstract state `last`, [N, N, 4]."""
         return EpisodeResult(
             seed=self.seed,
             solved=bool(solved),
@@ -60,7 +62,7 @@ class EpisodeLog:
             instructions=len(self._decisions),
             time_outs=sum(d.timed_out for d in self._decisions),
             wrong_estimates=sum(not d.estimate_right for d in self._decisions),
-            failure=None if solved else explain(self._decisions),
+            failure=None if solved else explain(self._decisions, last > 0.5),
         )
 
 
@@ -117,14 +119,15 @@ def is_unsolvable(state: NDArray[np.bool_]) -> bool:
     return solution.status == Status.UNSOLVABLE
 
 
-def explain(decisions: list[DecisionRecord]) -> Failure:
-    """Tell why an episode with the given decisions failed.
+def explain(decisions: list[DecisionRecord], last: NDArray[np.bool_]) -> Failure:
+    """Tell why an episode with the given decisions failed, which ended in the state `last`, [N, N, 4].
 
     A level that was lost is put down to the decision that lost it, the first after which the rules prove
-    that no solution is left; otherwise the last decisions tell what the episode was stuck on.
+    that no solution is left; otherwise the last decisions tell what the episode was stuck on. An agent without
+    modules decides nothing that could be looked at: only whether it lost the level can be told.
     """
     if not decisions:
-        return Failure.TIME_LIMIT
+        return Failure.LEVEL_LOST if is_unsolvable(last) else Failure.TIME_LIMIT
     if is_unsolvable(decisions[-1].truth) and not is_unsolvable(decisions[0].truth):
         return _explain_loss(decisions)
     tail = decisions[-TAIL:]
@@ -149,20 +152,6 @@ def _explain_loss(decisions: list[DecisionRecord]) -> Failure:
     fatal = decisions[solvable]
     if not fatal.estimate_right:
         return Failure.WRONG_ESTIMATE
-    if is_unsolvable(_by_the_rules(fatal)):
+    if is_unsolvable(abstract_successor(fatal.truth, fatal.instruction)):
         return Failure.PLANNER_DEAD_END
     return Failure.CONTROLLER_TIME_OUT if decisions[lost].timed_out else Failure.MISEXECUTION
-
-
-def _by_the_rules(decision: DecisionRecord) -> NDArray[np.bool_]:
-    """Return the abstract state to which the decision's instruction leads by the rules of Sokoban."""
-    state = decision.truth
-    boxes, player = np.argwhere(state[..., BOX]), np.argwhere(state[..., AGENT])[0]
-    boxes, player, *_ = rules.apply(
-        state[..., WALL], state[..., TARGET], boxes, player, Instruction(decision.instruction)
-    )
-    successor = state.copy()
-    successor[..., [AGENT, BOX]] = False
-    successor[player[0], player[1], AGENT] = True
-    successor[boxes[:, 0], boxes[:, 1], BOX] = True
-    return successor

@@ -142,6 +142,11 @@ class MonitorNode(Node):
         end, self._end = self._end, None
         assert end is not None
         self._ended = time.perf_counter()
-        self.results.append(self._log.result(solved=end.solved, steps=end.step, episode_return=end.episode_return))
+        assert self.latest is not None
+        self.results.append(
+            self._log.result(
+                solved=end.solved, steps=end.step, episode_return=end.episode_return, last=self.latest.truth
+            )
+        )
         if len(self.results) == self._episodes:
             self.finished.set_result(None)

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from bringup.command import Choice, Stack, oracle
+from bringup.command import Choice, Player, Solo, Stack, oracle
 from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_core.plugins import LEARNED, ROLES
+from mujoban_core.plugins import AGENT, LEARNED, ROLES
 from mujoban_core.program import say
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 
@@ -121,6 +121,28 @@ class ModuleOptions:
                 raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
             choices[role] = oracle(role, body)
         return Stack(choices, self.device, self.look_around, self.look_ahead, self.threads, body)
+
+
+@dataclass(frozen=True)
+class PlayerOptions(ModuleOptions):
+    """What plays, and how: the four modules or one agent."""
+
+    agent: Annotated[str | None, arg(metavar="WEIGHTS|MODULE:CLASS|NAME")] = None
+    """An agent that plays alone, in the place of all modules (docs/baselines.md)."""
+
+    def player(self, body: str = BALL.name) -> Player:
+        """Return the modules, or the agent.
+
+        Raises:
+            ValueError: If a role of `--oracle` is unknown, or modules are named beside an agent.
+        """
+        if self.agent is None:
+            return self.stack(body)
+        named = [role for role in ROLES if getattr(self, role) != LEARNED]
+        if named or self.oracle:
+            other = f"--{named[0]}" if named else "--oracle"
+            raise ValueError(f"--agent {self.agent} {other}: expected one of the two, since an agent plays alone")
+        return Solo(Choice.parse(AGENT, self.agent), self.device, self.threads, body)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,8 @@ class Failure(StrEnum):
     """Instructions ran into their time limit."""
     MISEXECUTION = "misexecution"
     """A right instruction led to another state than the rules say, and that state is unsolvable."""
+    LEVEL_LOST = "level lost"
+    """An agent without modules brought the level into a state that is unsolvable."""
     TIME_LIMIT = "time limit"
     """None of these: the episode's time ran out while the level could still be solved."""
 

@@ -6,19 +6,38 @@ Shapes: B rows of the world, M <= B rows in which an episode is still running.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
+from mujoban_core.bodies import FIRST_PERSON_CAMERA
+from mujoban_core.camera import TOP_DOWN_CAMERA
 from mujoban_core.interfaces import GroundTruth, Observation, module_seeds, renew_rows
-from mujoban_core.sense_plan_act import Decision, SensePlanAct
+from mujoban_core.sense_plan_act import Decision
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 
 Tree = TypeVar("Tree")
+
+
+class Policy(Protocol):
+    """What plays: `mujoban_core.sense_plan_act.SensePlanAct`, or `mujoban_core.agent.AgentPolicy`."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras whose frames it looks at."""
+        ...
+
+    def initial_state(self, seeds: NDArray[np.int64]) -> Any:
+        """Return the state at the start of episodes with the given seeds, [B]."""
+        ...
+
+    def step(self, obs: Observation, truth: GroundTruth, state: Any) -> tuple[Decision, Any]:
+        """Return the decision of a tick and the next state."""
+        ...
 
 
 class Ending(NamedTuple):
@@ -52,7 +71,9 @@ class Tick(NamedTuple):
 
 
 def select(tree: Tree, rows: NDArray[np.int64]) -> Tree:
-    """Return the given batch rows of every array in any nesting of tuples and NamedTuples."""
+    """Return the given batch rows of every array in any nesting of tuples and NamedTuples; None stays."""
+    if tree is None:
+        return tree
     if isinstance(tree, tuple):
         parts: list[Any] = [select(part, rows) for part in tree]
         return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)  # pyright: ignore
@@ -60,7 +81,7 @@ def select(tree: Tree, rows: NDArray[np.int64]) -> Tree:
 
 
 def ticks(
-    policy: SensePlanAct,
+    policy: Policy,
     world: World,
     episodes: Sequence[EpisodeSpec],
     *,
@@ -72,7 +93,7 @@ def ticks(
     The modules' random streams come from `run_seed` and the number of the episode, not from its level.
 
     Rows without a further episode leave the policy's batch, so that the last, long episodes cost no more
-    than they must. Frames are rendered if a module looks at them, unless `camera` says otherwise.
+    than they must. Frames are rendered if the policy looks at them, unless `camera` says otherwise.
     """
     if not episodes:
         return
@@ -84,12 +105,13 @@ def ticks(
     step = np.zeros(len(rows), np.int64)
     seeds = module_seeds(run_seed, episode + 1)
     state = policy.initial_state(seeds)
-    camera = needs_camera(policy) if camera is None else camera
+    camera = FIRST_PERSON_CAMERA in policy.cameras if camera is None else camera
+    above = TOP_DOWN_CAMERA in policy.cameras
     torque = np.zeros((world.batch, world.body.action_size), np.float32)
     instruction = np.zeros(world.batch, np.int64)
     issued = np.zeros(world.batch, np.bool_)
     while True:
-        observation, truth = observe(world, rows, camera=camera), select(world.truth(), rows)
+        observation, truth = observe(world, rows, camera=camera), tell(world, rows, above=above)
         decision, state = policy.step(observation, truth, state)
         torque[:], issued[:] = 0.0, False
         torque[rows], instruction[rows], issued[rows] = decision.torque, decision.instruction, decision.issued
@@ -100,7 +122,7 @@ def ticks(
         yield Tick(
             rows, episode, step, observation, truth, decision,
             world.reward[rows], world.episode_return[rows], solved, truncated,
-            _ending(world, rows[ended], camera=camera) if ended.any() else None,
+            _ending(world, rows[ended], camera=camera, above=above) if ended.any() else None,
         )
         step = step + 1
         if not ended.any():
@@ -123,12 +145,12 @@ def ticks(
             rows, episode, step, seeds, state = select((rows, episode, step, seeds, state), kept)
 
 
-def _ending(world: World, rows: NDArray[np.int64], *, camera: bool) -> Ending:
-    return Ending(observe(world, rows, camera=camera), select(world.truth(), rows))
+def _ending(world: World, rows: NDArray[np.int64], *, camera: bool, above: bool) -> Ending:
+    return Ending(observe(world, rows, camera=camera), tell(world, rows, above=above))
 
 
 def rollout(
-    policy: SensePlanAct,
+    policy: Policy,
     world: World,
     episodes: Sequence[EpisodeSpec],
     *,
@@ -137,7 +159,7 @@ def rollout(
     """Play every episode once and return the outcomes in the order of `episodes`.
 
     Args:
-        policy: The four modules.
+        policy: The four modules, or an agent.
         world: Its rows are all reset; their number is the batch.
         episodes: Levels and seeds.
         on_result: Called with the index of an episode and its outcome as soon as it has ended.
@@ -170,20 +192,23 @@ class Judge:
                 tick.truth.abstract_state[m], said.abstract_state[m], said.instruction[m], said.termination.timed_out[m]
             )
         results = []
-        for m in np.flatnonzero(tick.solved | tick.truncated):
-            index = int(tick.episode[m])
-            log = self._logs.pop(index)
+        for m, row in enumerate(np.flatnonzero(tick.solved | tick.truncated)):
+            assert tick.ending is not None
+            index = int(tick.episode[row])
+            log = self._logs.pop(index, None) or EpisodeLog(self._episodes[index].seed)
             results.append(
                 (index, log.result(
-                    solved=tick.solved[m], steps=tick.step[m] + 1, episode_return=tick.episode_return[m]
+                    solved=tick.solved[row], steps=tick.step[row] + 1, episode_return=tick.episode_return[row],
+                    last=tick.ending.truth.abstract_state[m],
                 ))
-            )
+            )  # fmt: skip
         return results
 
 
-def needs_camera(policy: SensePlanAct) -> bool:
-    """Tell whether any module looks at frames: oracles go by the ground truth."""
-    return not all(m.privileged for m in (policy.estimator, policy.termination, policy.controller))
+def tell(world: World, rows: NDArray[np.int64], *, above: bool) -> GroundTruth:
+    """Return what only the simulator knows of the given rows, with the view from above where that is wanted."""
+    truth = select(world.truth(), rows)
+    return truth._replace(top_down=world.render(TOP_DOWN_CAMERA, rows=rows)) if above else truth
 
 
 def observe(world: World, rows: NDArray[np.int64], *, camera: bool = True) -> Observation:

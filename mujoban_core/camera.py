@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FRAME_SIZE = 64
 """Rows and columns of the frames that the modules see (paper appendix B)."""
+TOP_DOWN_CAMERA: Final = "top_down"
+"""Name of the camera that sees the whole grid from above, north up; it yields o_top."""
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,8 @@ class GroundTruth(NamedTuple):
     """o_box, box centres in the map frame [m], [B, K, 2]; absent boxes lie far outside the grid."""
     completed: NDArray[np.bool_]
     """Whether the instruction in force is completed by the rule of paper C.4, [B]."""
+    top_down: NDArray[np.uint8] | None = None
+    """o_top, camera above the grid, RGB [B, 64, 64, 3]; None where nobody looks at it."""
 
 
 class EstimatorInput(NamedTuple):

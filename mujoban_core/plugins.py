@@ -14,6 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Final
 
+from mujoban_core.agent import Agent
 from mujoban_core.interfaces import Controller, Estimator, Module, Planner, Termination
 
 LEARNED: Final = "learned"
@@ -33,6 +34,9 @@ ROLES: Final[dict[str, type[Module]]] = {
 }
 """The four places in sense-plan-act and the interface of each."""
 
+AGENT: Final = "agent"
+"""The role of what plays alone, in the place of all four."""
+
 _SHIPPED: Final = "weights"
 
 
@@ -44,7 +48,7 @@ def load_module(role: str, source: str = LEARNED, weights: Path | None = None, d
     """Return the module for a role.
 
     Args:
-        role: One of `ROLES`.
+        role: One of `ROLES`, or `AGENT`.
         source: Name of an entry point of the role ("learned", "oracle"), or `package.module:Class`, whose instances
             are made without arguments.
         weights: Weights of the learned module instead of those that ship.
@@ -75,10 +79,11 @@ def shipped_weights(role: str) -> Path:
 
 
 def _interface(role: str) -> type[Module]:
+    interfaces: dict[str, type[Module]] = {**ROLES, AGENT: Agent}
     try:
-        return ROLES[role]
+        return interfaces[role]
     except KeyError:
-        raise PluginError(f"unknown module {role!r}: expected one of {', '.join(ROLES)}") from None
+        raise PluginError(f"unknown module {role!r}: expected one of {', '.join(interfaces)}") from None
 
 
 @cache

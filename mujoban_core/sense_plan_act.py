@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_core.bodies import FIRST_PERSON_CAMERA
 from mujoban_core.interfaces import (
     NO_INSTRUCTION,
     Controller,
@@ -58,6 +59,12 @@ class SensePlanAct:
     termination: Termination
     planner: Planner
     controller: Controller
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras whose frames a module looks at; oracles go by the ground truth."""
+        looking = not all(m.privileged for m in (self.estimator, self.termination, self.controller))
+        return (FIRST_PERSON_CAMERA,) if looking else ()
 
     def initial_state(self, seeds: NDArray[np.int64]) -> PolicyState:
         """Return the state at the start of episodes with the given seeds, [B]."""

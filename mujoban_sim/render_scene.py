@@ -15,15 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import ROBOT_BODY, ROBOT_DEFAULTS, Body
-from mujoban_core.camera import in_view
+from mujoban_core.camera import TOP_DOWN_CAMERA, in_view
 from mujoban_core.grid import GRID_SIZE
 from mujoban_sim.appearance import SKYLINE_SHAPE, Atlas, draw_skyline
 from mujoban_sim.meshes import MAX_QUADS, Mesh, level_mesh, skyline_mesh
 from mujoban_sim.presets import WorldPreset
 from mujoban_sim.scene import BOX_HALF_EXTENT, box_vertices
 
-TOP_DOWN_CAMERA: Final = "top_down"
-"""Name of the camera that sees the whole grid from above, north up; it yields o_top."""
 UNSEEN_GROUP: Final = 1
 """Geom group of what the first-person camera never sees."""
 _TOP_DOWN_HEIGHT: Final = 16.0

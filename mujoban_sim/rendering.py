@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mujoban_core.bodies import FIRST_PERSON_CAMERA, Body
-from mujoban_core.camera import FRAME_SIZE, in_view
+from mujoban_core.camera import FRAME_SIZE, TOP_DOWN_CAMERA, in_view
 from mujoban_core.grid import GRID_SIZE, cell_to_xy
 from mujoban_core.worker import Worker
 from mujoban_sim.appearance import (
@@ -28,7 +28,7 @@ from mujoban_sim.appearance import (
     TARGET_COLOUR,
 )
 from mujoban_sim.presets import WorldPreset
-from mujoban_sim.render_scene import TOP_DOWN_CAMERA, UNSEEN_GROUP, RenderScene, build_scene, write_level
+from mujoban_sim.render_scene import UNSEEN_GROUP, RenderScene, build_scene, write_level
 from mujoban_sim.scene import BOX_HALF_EXTENT
 from mujoban_sokoban.levels import Level
 

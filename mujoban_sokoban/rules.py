@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from mujoban_core.grid import OFFSETS_RC, Instruction
+from mujoban_core.grid import AGENT, BOX, OFFSETS_RC, TARGET, WALL, Instruction
 
 BOX_REWARD: Final = 1.0
 """Reward of pushing a box onto a target, and penalty of pushing it off."""
@@ -126,3 +126,14 @@ def apply(
     _apply_in_place(walls, targets, new_boxes, new_player, instructions, reward, solved, moved)
     result = Transition(new_boxes, new_player, reward, solved, moved)
     return Transition(*(array[0] for array in result)) if single else result
+
+
+def abstract_successor(state: NDArray[np.bool_], instruction: int) -> NDArray[np.bool_]:
+    """Return the abstract state to which an instruction leads from one with a single agent, [N, N, 4] each."""
+    boxes, player = np.argwhere(state[..., BOX]), np.argwhere(state[..., AGENT])[0]
+    after = apply(state[..., WALL], state[..., TARGET], boxes, player, int(instruction))
+    successor = state.copy()
+    successor[..., [AGENT, BOX]] = False
+    successor[after.player[0], after.player[1], AGENT] = True
+    successor[after.boxes[:, 0], after.boxes[:, 1], BOX] = True
+    return successor

@@ -1,0 +1,32 @@
+"""The floor of every comparison: torques drawn at random."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mujoban_core.agent import Agent, AgentInput
+from mujoban_core.bodies import BALL
+from mujoban_core.interfaces import Memory, counter_uniform
+
+
+class RandomAgent(Agent):
+    """Draws every torque evenly from [-1, 1]; sees o_pr only to know how many robots there are."""
+
+    sees = ("proprio",)
+    config = {"body": BALL.name}  # noqa: RUF012 - as the networks declare it
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return seeds 0 and no draws yet, [B] each."""
+        return self.initial_state(np.zeros(batch, np.int64))
+
+    def initial_state(self, seeds: NDArray[np.int64]) -> Memory:
+        """Return the seeds of the draws and their number so far, [B] each."""
+        return np.asarray(seeds, np.int64), np.zeros(len(seeds), np.int64)
+
+    def step(self, inputs: AgentInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
+        """Return torques, [B, U], and the next state."""
+        seed, drawn = state
+        size = BALL.action_size
+        draws = [counter_uniform(seed, drawn + i) for i in range(size)]
+        return np.stack([2.0 * d - 1.0 for d in draws], -1).astype(np.float32), (seed, drawn + size)

@@ -1,0 +1,114 @@
+"""Agents that play alone: on the same levels, with the same report, seeing what they ask for and nothing else."""
+
+import numpy as np
+import pytest
+
+from bringup.command import Choice, Solo
+from bringup.evaluate import evaluate, main
+from bringup.results import Failure
+from mujoban_core.agent import Agent, AgentInput, AgentPolicy
+from mujoban_core.interfaces import GroundTruth, Observation
+from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.levels import Level, write_levels
+
+
+class Watcher(Agent):
+    """Notes what it is shown, and drives straight on."""
+
+    def __init__(self, sees=("frame", "proprio", "pose")):
+        self.sees = sees
+        self.shown = []
+
+    def initial_memory(self, batch):
+        return (np.zeros(batch, np.int64),)
+
+    def step(self, inputs: AgentInput, state):
+        (ticks,) = state
+        self.shown.append((inputs, ticks))
+        torque = np.zeros((len(ticks), 2), np.float32)
+        torque[:, 0] = 1.0
+        return torque, (ticks + 1,)
+
+
+@pytest.mark.parametrize("sees", [("frame", "proprio", "pose"), ("top_down", "abstract_state"), ("pose",)])
+def test_an_agent_is_shown_what_it_asks_for_and_nothing_else(sees):
+    agent = Watcher(sees)
+    evaluate(AgentPolicy(agent), Episodes(3, 0, difficulty=1), batch=2, time_limit=3)
+    shown, ticks = agent.shown[0]
+    assert {name for name, value in shown._asdict().items() if value is not None} == set(sees)
+    assert all(len(getattr(shown, name)) == 2 for name in sees)
+    assert agent.privileged == ("top_down" in sees)
+    assert ticks.tolist() == [0, 0] and agent.shown[3][1].tolist() == [0], "each episode starts with fresh memory"
+
+
+def test_what_is_privileged_never_reaches_an_agent_that_does_not_declare_it():
+    observation = Observation(np.zeros((1, 64, 64, 3), np.uint8), np.zeros((1, 16)), np.zeros((1, 3)))
+    truth = GroundTruth(*(np.zeros((1, 1)) for _ in range(5)))
+    agent = Watcher(("pose",))
+    AgentPolicy(agent).step(observation, truth, agent.initial_memory(1))
+    assert agent.shown[0][0].abstract_state is None
+    blind = Watcher(("top_down",))
+    with pytest.raises(ValueError, match="sees top_down, which is missing"):
+        AgentPolicy(blind).step(observation, truth, blind.initial_memory(1))
+    with pytest.raises(ValueError, match="sees 'smell': expected some of frame"):
+        AgentPolicy(Watcher(("smell",))).step(observation, truth, ())
+
+
+LANE = """\
+######
+#@$ .#
+######
+"""
+CORNER = """\
+#######
+#.    #
+#     #
+#  @$ #
+#######
+"""
+
+
+def test_an_agent_that_pushes_a_box_home_is_rewarded_and_one_that_pushes_it_into_a_corner_has_lost(tmp_path):
+    outcomes = []
+    for text in (LANE, CORNER):
+        path = tmp_path / "level.txt"
+        write_levels(path, [Level.from_text(text)])
+        agent = AgentPolicy(Eastward())
+        outcomes += evaluate(agent, Episodes(1, 0, level_file=path), time_limit=400)
+    solved, lost = outcomes
+    assert solved.solved and solved.episode_return == pytest.approx(11.0) and solved.failure is None
+    assert not lost.solved and lost.failure == Failure.LEVEL_LOST
+
+
+class Eastward(Agent):
+    """Turns east, then drives; sees the pose alone."""
+
+    sees = ("pose",)
+
+    def initial_memory(self, batch):
+        return ()
+
+    def step(self, inputs: AgentInput, state):
+        yaw = inputs.pose[:, 2]
+        steer = -0.6 * np.sin(yaw / 2)
+        roll = np.where((np.cos(yaw) > 0.97), 0.5, 0.0)
+        return np.stack([roll, steer], -1).astype(np.float32), state
+
+
+def test_a_named_agent_is_evaluated_with_the_report_of_the_stack(tmp_path, capsys):
+    file = tmp_path / "report.json"
+    played = ["--agent", "random", "--difficulty", "1", "--episodes", "3", "--time-limit", "20", "--json", str(file)]
+    assert main(played) == 0
+    assert '"agent": "random"' in file.read_text() and '"success_interval"' in file.read_text()
+    assert "solved 0 of 3" in capsys.readouterr().out
+
+
+def test_contradictions_and_unknown_agents_are_one_line():
+    with pytest.raises(ValueError, match=r"--agent random --planner: expected one of the two"):
+        main(["--agent", "random", "--planner", "oracle"])
+    with pytest.raises(ValueError, match="no agent is named 'nobody'"):
+        Solo(Choice.parse("agent", "nobody")).policy()
+    with pytest.raises(ValueError, match="trained for the body ball"):
+        Solo(Choice.parse("agent", "random"), body="ant").policy()
+    with pytest.raises(ValueError, match=r"expected a \.safetensors file"):
+        Solo(Choice.parse("agent", "learned")).policy()
