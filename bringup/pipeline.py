@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -47,6 +48,8 @@ class Stage:
     seconds: float = 60.0
     """How long it is expected to take; for the progress that is shown."""
     cores: int = 1
+    resumes: bool = True
+    """Whether the command goes on where it was stopped; if not, what it had made is removed before it starts again."""
 
 
 @dataclass
@@ -102,7 +105,7 @@ class Pipeline:
 
     def _check_command(self, stage: Stage) -> None:
         entry = self.entries[stage.name]
-        if entry.command and entry.command != list(stage.command):
+        if entry.done and entry.command != list(stage.command):
             raise PipelineError(
                 f"{self.directory}: stage {stage.name} ran as {' '.join(entry.command)}, not as "
                 f"{' '.join(stage.command)}; expected the options of before, or another directory"
@@ -160,6 +163,8 @@ class Pipeline:
         entry.command = list(stage.command)
         entry.inputs = {k: v for need in stage.needs for k, v in self.entries[need].outputs.items()}
         self._save()
+        if not stage.resumes:
+            _remove(stage.products)
         log = self._log(stage.name)
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as output:
@@ -204,6 +209,14 @@ class Pipeline:
         self.directory.mkdir(parents=True, exist_ok=True)
         content: Mapping[str, Any] = {name: asdict(entry) for name, entry in self.entries.items() if entry.command}
         write_atomically(self._file, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def _remove(paths: Sequence[Path]) -> None:
+    for path in paths:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _name(path: Path, directory: Path) -> str:

@@ -27,7 +27,7 @@ from mujoban_sokoban.generator import TRAIN_SEEDS, VALIDATION_SEEDS
 PROG = "mujoban.train_all"
 WEIGHTS: Final = {
     "controller": "controller_mpo/controller.safetensors",
-    "planner": "planner/planner.safetensors",
+    "planner": "planner_views/planner.safetensors",
     "estimator": "estimator_second/weights/estimator.safetensors",
     "termination": "estimator_second/weights/termination.safetensors",
 }
@@ -37,19 +37,28 @@ SHARES: Final = {
     "controller_distil": 0.23,
     "controller_mpo": 0.12,
     "planner": 0.40,
+    "planner_views": 0.06,
     "bags_first": 0.03,
-    "estimator_first": 0.19,
+    "estimator_first": 0.16,
     "bags_second": 0.03,
     "estimator_second": 0.19,
     "evaluation": 0.08,
 }
 """Share of the hours that each stage gets. Controller and planner train side by side, on one core each."""
+_STEPS: Final = 10**12
+"""More than any budget of time lets a trainer take."""
 _SAVED: Final = 0.92
 """Of a stage's share goes into training; the rest into starting, judging and saving."""
 _EPISODES_PER_HOUR: Final = 90
 """Recorded in each round, per hour of the whole run."""
 _RECORDED_STEPS: Final = 900
 """Longest recorded episode."""
+_EVALUATED_STEPS: Final = 500_000
+"""Environment steps of the controller's training between two evaluations, which no budget counts."""
+_SENSES: Final = ("--streams", "5", "--learner.slip", "0.015", "--learner.lost", "0.05")
+"""Batch of estimator and termination, and how far the odometer is off in training."""
+_VIEWS: Final = ("--noise", "0.1", "--hidden", "0.3")
+"""Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
 _STREAMS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, this many times a billion seeds into those for training."""
 
@@ -85,6 +94,7 @@ def _seconds(options: Options, name: str) -> float:
 
 
 def _trainer(options: Options, name: str, command: Sequence[str], product: str, *needs: str, cores: int = 1) -> Stage:
+    """Return a stage that trains for its share of the hours, which no limit of steps cuts short."""
     seconds = _seconds(options, name)
     budget = ("--cpu-seconds", str(round(_SAVED * seconds * cores)))
     folder = options.run / name
@@ -96,6 +106,7 @@ def _controller(options: Options) -> list[Stage]:
     run = options.run
     common = ("--seed", str(options.seed), "--task.world", options.world)
     teacher, student = "teacher/teacher.safetensors", "controller_distil/controller.safetensors"
+    common += ("--steps", str(_STEPS), "--evaluate-every", str(_EVALUATED_STEPS))
     train = "mujoban_controller.train"
     return [
         _trainer(options, "teacher", (train, "--stage", "teacher", *common), teacher),
@@ -111,14 +122,20 @@ def _controller(options: Options) -> list[Stage]:
 
 
 def _planner(options: Options) -> list[Stage]:
-    command = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.seed))
-    return [_trainer(options, "planner", command, WEIGHTS["planner"])]
+    """Return the stages of the planner: boards in full view, then also boards as an estimator sees them."""
+    method = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.seed), "--evaluate-every", "900")
+    whole = "planner/planner.safetensors"
+    views = ("--init", str(options.run / whole), "--learning-rate", "7e-4", *_VIEWS)
+    return [
+        _trainer(options, "planner", method, whole),
+        _trainer(options, "planner_views", (*method, *views), WEIGHTS["planner"], "planner"),
+    ]
 
 
 def _senses(options: Options) -> list[Stage]:
     found = []
     bags: list[str] = []
-    acting = ("controller_mpo", "planner")
+    acting = ("controller_mpo", "planner_views")
     for round_, sense in (("first", ("--oracle", "estimator,termination")), ("second", _modules(options, "first"))):
         recording = f"bags_{round_}"
         needs = acting if round_ == "first" else (*acting, "estimator_first")
@@ -127,7 +144,7 @@ def _senses(options: Options) -> list[Stage]:
         name = f"estimator_{round_}"
         out = options.run / name / "weights"
         command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out), "--threads", str(options.cores)]
-        command += ["--seed", str(options.seed)]
+        command += ["--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
         if round_ == "second":
             command += ["--start", str(options.run / "estimator_first" / "weights")]
         found.append(_trainer(options, name, command, f"{name}/weights", recording, cores=options.cores))
@@ -148,7 +165,7 @@ def _recording(options: Options, name: str, sense: tuple[str, ...], needs: tuple
         "--seed", str(TRAIN_SEEDS.start + _STREAMS[name] * 10**9), "--time-limit", str(_RECORDED_STEPS),
         "--processes", str(options.cores), "--world", options.world, *sense, *acting,
     )  # fmt: skip
-    return Stage(name, command, (run / name,), needs, _seconds(options, name), options.cores)
+    return Stage(name, command, (run / name,), needs, _seconds(options, name), options.cores, resumes=False)
 
 
 def _evaluation(options: Options) -> Stage:
@@ -159,7 +176,7 @@ def _evaluation(options: Options) -> Stage:
         "--seed", str(VALIDATION_SEEDS.start), "--world", options.world, "--json", str(run / "evaluation.json"),
         *weights,
     )  # fmt: skip
-    needs = ("estimator_second", "planner", "controller_mpo")
+    needs = ("estimator_second", "planner_views", "controller_mpo")
     return Stage(
         "evaluation", command, (run / "evaluation.json",), needs, _seconds(options, "evaluation"), options.cores
     )

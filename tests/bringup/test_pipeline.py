@@ -82,6 +82,22 @@ def test_another_command_for_a_stage_that_began_is_refused(tmp_path):
         Pipeline(tmp_path, [Stage("first", ("-c", "pass"), ())])
 
 
+def test_a_stage_that_failed_may_be_tried_with_another_command(tmp_path):
+    with pytest.raises(PipelineError, match="stage first ended with"):
+        Pipeline(tmp_path, [Stage("first", ("-c", "unknown"), (tmp_path / "a.txt",))]).run()
+    Pipeline(tmp_path, stages(tmp_path)).run()
+    assert (tmp_path / "b.txt").read_text() == "ab"
+
+
+def test_what_a_stage_that_cannot_resume_had_made_is_removed_before_it_starts_again(tmp_path):
+    bags = tmp_path / "bags"
+    bags.mkdir()
+    (bags / "half").touch()
+    record = ("-c", f"import pathlib; p = pathlib.Path({str(bags)!r}); p.mkdir(); (p / 'whole').touch()")
+    Pipeline(tmp_path, [Stage("record", record, (bags,), resumes=False)]).run()
+    assert [p.name for p in bags.iterdir()] == ["whole"]
+
+
 def test_stages_without_needs_run_side_by_side_up_to_the_cores(tmp_path):
     def waits_for(mine, other):
         code = f"import pathlib, time; pathlib.Path({str(mine)!r}).touch()\n"
