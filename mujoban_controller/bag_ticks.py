@@ -1,34 +1,39 @@
-"""Ticks for MPO of the camera policy from recorded bags of the running stack (see `mujoban_msgs_py.bags`).
+"""Ticks for the camera policy from recorded bags of the running stack (see `mujoban_msgs_py.bags`).
 
 What the goal task would have said is worked out from the ground truth in the bag: goals, privileged features,
-rewards and discounts. The memory before a tick is that of the policy that learns, which is run over the episode
-for it.
+rewards and discounts, and with them what a privileged teacher would have done. The memory before a tick is that of
+the policy that learns, which is run over the episode for it.
 
 Shapes: L ticks of an episode, R rows, K boxes, N rows and columns of the grid, U actuators.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mujoban_controller.controller import INPUT_FIELDS, MEMORY_FIELDS, Recurrent, VisuomotorController
-from mujoban_controller.goal_features import feature_layout, privileged_features, side_ahead
+from mujoban_controller.goal_features import feature_layout, goal_offsets, privileged_features, side_ahead
 from mujoban_controller.goal_rewards import GoalReward
 from mujoban_controller.goal_settings import GoalTaskConfig
-from mujoban_controller.goal_task import LOOK_AGAIN
+from mujoban_controller.goal_task import LOOK_AGAIN, Outcome
 from mujoban_controller.goal_view import StoredView
-from mujoban_controller.play import Fields
+from mujoban_controller.play import Fields, Player
+from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_core.bodies import Body, get_body
 from mujoban_core.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMIT, WALL
+from mujoban_core.interfaces import renew_rows
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
 from mujoban_msgs_py.bags.training import episode_ticks, find_bags, open_training_bag
+from mujoban_rl.engine import State
 from mujoban_sim.goals import GoalKind, GoalTracker
 from mujoban_sim.oracles import cells_of_boxes
 
@@ -117,6 +122,8 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
         "action": np.take_along_axis(applied, order, 1)[:-1],
         "reward": rule.after(view.at(now + 1, now), there, change, ended & completed[1:], failed),
         "discount": discount,
+        "goal": goal_offsets(view)[:-1],
+        "kind": goals.kind[:-1].copy(),
     }
 
 
@@ -152,51 +159,150 @@ def _goals(
     return goals, np.array(elapsed)
 
 
-class BagTicks(Iterator[Fields]):
-    """Endless ticks of R episodes at a time; each row takes bag after bag in an order that is drawn anew each time.
+class _Row:
+    """The endless ticks of one robot: bag after bag, in an order that is drawn anew each time."""
 
-    Where a run is resumed the rows begin anew.
-    """
+    def __init__(
+        self, bags: Sequence[Bag], read: Callable[[Bag, int], Fields | None], rng: np.random.Generator
+    ) -> None:
+        """Begin with a random bag; `read` returns the fields of a bag's episode by its number, None behind the last."""
+        self._bags, self._read, self._rng = bags, read, rng
+        self._order: list[int] = []
+        self._bag = self._episode = self._tick = 0
+        self._fields: Fields | None = None
+
+    def next(self) -> tuple[Fields, int]:
+        """Return the fields of an episode, [L - 1, ...], and the number of the tick whose turn it is."""
+        fields = self._fields
+        if fields is None or self._tick == len(fields["first"]):
+            fields = self._following(begin=fields is None)
+            self._fields, self._tick = fields, 0
+        self._tick += 1
+        return fields, self._tick - 1
+
+    def _following(self, *, begin: bool) -> Fields:
+        """Return the fields of the episode that comes next."""
+        if not begin:
+            self._episode += 1
+        empty = 0
+        while True:
+            if self._bag == len(self._order):
+                self._order, self._bag = self._rng.permutation(len(self._bags)).tolist(), 0
+            if (fields := self._read(self._bags[self._order[self._bag]], self._episode)) is not None:
+                return fields
+            empty = empty + 1 if self._episode == 0 else 0
+            if empty == len(self._bags):
+                raise BagError(f"no episode of 2 ticks in {len(self._bags)} bags")
+            self._bag, self._episode = self._bag + 1, 0
+
+    def state(self) -> State:
+        """Return where it is."""
+        return State({"order": self._order, "bag": self._bag, "episode": self._episode, "tick": self._tick})
+
+    def restore(self, state: State) -> None:
+        """Go on where it was."""
+        values = state.values
+        self._order, self._bag = list(values["order"]), values["bag"]
+        self._episode, self._tick = values["episode"], values["tick"]
+        began = self._bag < len(self._order)
+        self._fields = self._read(self._bags[self._order[self._bag]], self._episode) if began else None
+
+
+class BagTicks(Iterator[Fields]):
+    """Endless ticks of R episodes at a time, with the memory of the policy that learns."""
 
     def __init__(
         self, paths: Sequence[Path], config: GoalTaskConfig, policy: VisuomotorController, rows: int,
-        rng: np.random.Generator,
+        rng: np.random.Generator, teacher: PrivilegedPolicy | None = None,
     ) -> None:  # fmt: skip
-        """Read `rows` rows from bags, or folders of bags; `policy` is the one that acts, whose weights change.
+        """Read `rows` rows.
+
+        Args:
+            paths: Bags, or folders of bags.
+            config: Rewards and body.
+            policy: The one that acts, whose weights change.
+            rows: R.
+            rng: Draws the order of the bags.
+            teacher: Labels each tick with the torques that it would have applied.
 
         Raises:
             BagError: If there is no bag at a path, or one lacks a topic.
         """
-        self._config, self._policy, self._rng = config, policy, rng
-        self._bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
-        self._rows = [self._endless() for _ in range(rows)]
+        self._config, self._policy, self._rng, self._teacher = config, policy, rng, teacher
+        bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
+        self._rows = [_Row(bags, self._read, rng) for _ in range(rows)]
+        self._memory = Recurrent(*policy.initial_memory(rows))
 
+    def _read(self, bag: Bag, number: int) -> Fields | None:
+        """Return the fields of episode `number` of a bag among those of two ticks or more; None behind the last."""
+        long = (ticks for ticks in episodes(bag) if len(ticks) > 1)
+        ticks = next(islice(long, number, None), None)
+        if ticks is None:
+            return None
+        fields = transitions(ticks, self._config)
+        return fields if self._teacher is None else fields | {"label": labels(self._teacher, fields)}
+
+    @torch.no_grad()
     def __next__(self) -> Fields:
         """Return one tick of every row with the policy's memory before it, [R, ...] each.
 
         Raises:
             BagError: As `episodes` and `transitions`, or if no episode has two ticks.
         """
-        ticks = [next(row) for row in self._rows]
-        return {name: np.stack([tick[name] for tick in ticks]) for name in ticks[0]}
+        found = [row.next() for row in self._rows]
+        tick = {name: np.stack([fields[name][t] for fields, t in found]) for name in found[0][0]}
+        fresh = self._policy.initial_memory(len(self._rows))
+        memory = Recurrent(*renew_rows(self._memory, fresh, tick["first"]))
+        seen = (torch.from_numpy(tick[name])[:, None] for name in INPUT_FIELDS)
+        self._memory = self._policy(*seen, memory=memory).memory
+        return tick | {name: m.numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
 
-    def _endless(self) -> Iterator[Fields]:
-        while True:
-            count = 0
-            for i in self._rng.permutation(len(self._bags)):
-                for ticks in episodes(self._bags[i]):
-                    if len(ticks) > 1:
-                        count += 1
-                        yield from self._play(transitions(ticks, self._config))
-            if not count:
-                raise BagError(f"no episode of 2 ticks in {len(self._bags)} bags")
+    def state(self) -> State:
+        """Return where each row is, with the policy's memory."""
+        memory = {name: m for name, m in zip(MEMORY_FIELDS, self._memory, strict=True)}
+        own = State({"rng": self._rng.bit_generator.state}, memory)
+        return State.of({"own": own} | {f"row{i}": row.state() for i, row in enumerate(self._rows)})
 
-    @torch.no_grad()
-    def _play(self, fields: Fields) -> Iterator[Fields]:
-        """Yield an episode's ticks with the policy's memory before each."""
-        memory = Recurrent(*self._policy.initial_memory(1))
-        for t in range(len(fields["first"])):
-            before = {name: m[0].numpy().copy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
-            yield {k: v[t] for k, v in fields.items()} | before
-            seen = (torch.from_numpy(np.asarray(fields[k][t : t + 1]))[None] for k in INPUT_FIELDS)
-            memory = self._policy(*seen, memory=memory).memory
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        own = state.part("own")
+        self._rng.bit_generator.state = own.values["rng"]
+        self._memory = Recurrent(*(own.tensors[name] for name in MEMORY_FIELDS))
+        for i, row in enumerate(self._rows):
+            row.restore(state.part(f"row{i}"))
+
+
+@torch.inference_mode()
+def labels(teacher: PrivilegedPolicy, fields: Fields) -> NDArray[np.float32]:
+    """Return the torques that a teacher would have applied in the ticks of an episode, [L - 1, U]."""
+    action = teacher(torch.from_numpy(fields["features"])).mean.clamp(-1.0, 1.0).numpy()
+    torque = np.empty_like(action)
+    np.put_along_axis(torque, feature_layout(get_body(teacher.config["body"])).actuators[fields["side"]], action, 1)
+    return torque
+
+
+class BagPlayer(Player):
+    """Plays nothing: its ticks are those of recordings."""
+
+    def __init__(self, ticks: BagTicks, policy: VisuomotorController) -> None:
+        """Take ticks from `ticks`, whose memory is that of `policy`."""
+        self._ticks, self._policy = ticks, policy
+
+    def tick(self) -> tuple[Fields, Sequence[Outcome]]:
+        """Return the next tick of each row, [R, ...] each; nobody counts how instructions ended."""
+        return next(self._ticks), ()
+
+    def take(self, weights: Mapping[str, Tensor]) -> None:
+        """Remember with these weights from now on."""
+        self._policy.load_state_dict(dict(weights))
+
+    def state(self) -> State:
+        """Return where the recordings are."""
+        return self._ticks.state()
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._ticks.restore(state)
+
+    def close(self) -> None:
+        """Do nothing: bags are open only while they are read."""

@@ -6,7 +6,7 @@ Shapes: B robots, R recorded rows, M windows of a batch, W ticks of a window, D 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_controller.controller import INPUT_FIELDS, MEMORY_FIELDS, Recurrent, VisuomotorController
-from mujoban_controller.goal_task import GoalTask, TaskStep
+from mujoban_controller.goal_task import GoalTask, Outcome
 from mujoban_controller.judge import OutcomeSummary
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_core.interfaces import ControllerInput, Memory, renew_rows
@@ -27,17 +27,33 @@ Batch = dict[str, Tensor]
 
 
 class Player(ABC):
-    """Acts in the goal task with a policy of its own, whose weights `take` renews."""
-
-    task: GoalTask
+    """Gives ticks to learn from, with a policy of its own, whose weights `take` renews."""
 
     @abstractmethod
-    def tick(self) -> tuple[Fields, TaskStep]:
-        """Play one tick; return what is to be kept of it, [B, ...] each, and what happened."""
+    def tick(self) -> tuple[Fields, Sequence[Outcome]]:
+        """Play one tick; return what is to be kept of it, [B, ...] each, and the instructions that ended."""
 
     @abstractmethod
     def take(self, weights: Mapping[str, Tensor]) -> None:
         """Act with these weights from now on."""
+
+    @abstractmethod
+    def state(self) -> State:
+        """Return all that changes but the weights."""
+
+    @abstractmethod
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free what it holds."""
+
+
+class TaskPlayer(Player):
+    """Acts in the goal task."""
+
+    task: GoalTask
 
     def state(self) -> State:
         """Return all that changes but the weights."""
@@ -47,8 +63,12 @@ class Player(ABC):
         """Take over what `state` returned."""
         self.task.restore(state.part("task"))
 
+    def close(self) -> None:
+        """Free the cameras."""
+        self.task.world.close()
 
-class PrivilegedPlayer(Player):
+
+class PrivilegedPlayer(TaskPlayer):
     """A privileged policy that explores."""
 
     def __init__(self, task: GoalTask, policy: PrivilegedPolicy, generator: torch.Generator) -> None:
@@ -58,14 +78,14 @@ class PrivilegedPlayer(Player):
         self._features: NDArray[np.float32] = task.features()
 
     @torch.no_grad()
-    def tick(self) -> tuple[Fields, TaskStep]:
+    def tick(self) -> tuple[Fields, Sequence[Outcome]]:
         """Play one tick."""
         features = self._features
         action = self._policy(torch.from_numpy(features)).sample(self._generator).clamp(-1.0, 1.0).numpy()
         result = self.task.step(self.task.torque_of(action))
         self._features = self.task.features()
         kept = {"features": features, "action": action, "reward": result.reward, "discount": result.discount}
-        return kept, result
+        return kept, result.outcomes
 
     def take(self, weights: Mapping[str, Tensor]) -> None:
         """Act with these weights from now on."""
@@ -83,7 +103,7 @@ class PrivilegedPlayer(Player):
         self._features = self.task.features()
 
 
-class CameraPlayer(Player):
+class CameraPlayer(TaskPlayer):
     """A camera policy with its memory; what it makes of its distribution over torques is up to subclasses."""
 
     def __init__(self, task: GoalTask, policy: VisuomotorController, generator: torch.Generator) -> None:
@@ -99,7 +119,7 @@ class CameraPlayer(Player):
         return self._policy
 
     @torch.no_grad()
-    def tick(self) -> tuple[Fields, TaskStep]:
+    def tick(self) -> tuple[Fields, Sequence[Outcome]]:
         """Play one tick."""
         task, first = self.task, self.task.first.copy()
         memory = renew_rows(self._memory, self._policy.initial_memory(len(first)), first)
@@ -110,7 +130,8 @@ class CameraPlayer(Player):
         kept |= {name: m.numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
         torque, extra = self._act(inputs, output.action.mean[:, 0], output.action.scale[:, 0])
         result = task.step(torque)
-        return {**kept, "first": first, **extra, "reward": result.reward, "discount": result.discount}, result
+        kept |= {"first": first, **extra, "reward": result.reward, "discount": result.discount}
+        return kept, result.outcomes
 
     @abstractmethod
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
@@ -171,7 +192,7 @@ class ReplaySource(Source[Batch]):
     """Windows of W successive ticks, drawn evenly from what a player has played last, and from recordings beside it."""
 
     def __init__(
-        self, player: Player, draw: Draw, generator: torch.Generator, recorded: Iterator[Fields] | None = None
+        self, player: Player, draw: Draw, generator: torch.Generator, recorded: Player | None = None
     ) -> None:
         """Play and draw.
 
@@ -179,7 +200,7 @@ class ReplaySource(Source[Batch]):
             player: Adds B rows to each tick.
             draw: How batches are drawn.
             generator: Draws windows.
-            recorded: Ticks of recordings that are kept beside those of the player, [R, ...] each.
+            recorded: Gives ticks of recordings, which are kept beside those of the player, [R, ...] each.
         """
         self._player, self._draw, self._generator, self._recorded = player, draw, generator, recorded
         self._replay = SequenceReplay(draw.capacity, draw.length)
@@ -193,8 +214,10 @@ class ReplaySource(Source[Batch]):
         return self._player
 
     def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
-        """Let the player act with these weights."""
+        """Let the player act with these weights, and the recordings' memory be theirs."""
         self._player.take(weights)
+        if self._recorded is not None:
+            self._recorded.take(weights)
 
     def next_batch(self) -> Batch:
         """Play until a batch is due; return windows, [M, W, ...] each."""
@@ -204,11 +227,11 @@ class ReplaySource(Source[Batch]):
         return self._replay.sample(self._draw.windows, self._generator, self._draw.window)
 
     def _play(self) -> None:
-        tick, result = self._player.tick()
-        self._summary.add(result.outcomes)
-        self.samples += len(result.reward)
+        tick, outcomes = self._player.tick()
+        self._summary.add(outcomes)
+        self.samples += len(tick["reward"])
         if self._recorded is not None:
-            beside = next(self._recorded)
+            beside, _ = self._recorded.tick()
             tick = {name: np.concatenate([values, beside[name]]) for name, values in tick.items()}
         sequence = self._builder.add(tick)
         if sequence is not None:
@@ -226,11 +249,15 @@ class ReplaySource(Source[Batch]):
         """Return the replay, the player's state and what draws from them."""
         own = State({"due": self._due, "ticks": self._ticks}, {"generator": self._generator.get_state()})
         parts = {"player": self._player.state(), "replay": self._replay.state(), "builder": self._builder.state()}
+        if self._recorded is not None:
+            parts["recorded"] = self._recorded.state()
         return State.of({**parts, "own": own})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         self._player.restore(state.part("player"))
+        if self._recorded is not None:
+            self._recorded.restore(state.part("recorded"))
         self._replay.restore(state.part("replay"))
         self._builder.restore(state.part("builder"))
         own = state.part("own")
@@ -238,5 +265,5 @@ class ReplaySource(Source[Batch]):
         self._generator.set_state(own.tensors["generator"])
 
     def close(self) -> None:
-        """Free the cameras."""
-        self._player.task.world.close()
+        """Free what the player holds."""
+        self._player.close()

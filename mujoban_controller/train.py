@@ -3,14 +3,17 @@
 1. `teacher`: a privileged policy learns the goal task from its rewards alone, by MPO or PPO (`--algorithm`).
 2. `distil --teacher WEIGHTS`: it is distilled into the camera policy, on the states that this one visits.
 3. `mpo --initial WEIGHTS`: the camera policy learns on by MPO with an asymmetric critic (paper C.3); without initial
-   weights from scratch. With `--bags`, recorded bags of the running stack join its replay.
+   weights from scratch.
+
+With `--bags`, recorded bags of the running stack join the replay of `distil` and `mpo`; with `--bag-share 1` nothing
+else does: such a run learns offline and drives no simulator.
 
 Give the directory again to resume a run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +22,7 @@ import numpy as np
 import torch
 import tyro
 
-from mujoban_controller.bag_ticks import BagTicks
+from mujoban_controller.bag_ticks import BagPlayer, BagTicks
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.distil import DistilConfig, DistilLearner, DistilPlayer
 from mujoban_controller.episodes import TrainingEpisodes
@@ -96,9 +99,9 @@ class Options:
     """Run directory; an existing one is resumed."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
     bags: tuple[Path, ...] = ()
-    """Recorded bags, or folders of bags, whose ticks join the replay of the stage mpo."""
+    """Recorded bags, or folders of bags, whose ticks join the replay of the stages distil and mpo."""
     bag_share: float = 0.25
-    """Share of the replay's new ticks that comes from bags, if there are any."""
+    """Share of the replay's new ticks that comes from bags, if there are any; 1: all, and nothing is simulated."""
     seconds: float | None = None
     """Stop after so many seconds; resume later."""
     evaluate_every: int = 300_000
@@ -110,10 +113,10 @@ class Options:
 
     def __post_init__(self) -> None:
         """Reject bags that nothing would learn from."""
-        if self.bags and self.config.stage != "mpo":
-            raise ValueError("--bags: only the stage mpo learns from them; expected --stage mpo")
-        if not 0.0 < self.bag_share < 1.0:
-            raise ValueError(f"--bag-share {self.bag_share}: expected a share between 0 and 1")
+        if self.bags and self.config.stage == "teacher":
+            raise ValueError("--bags: a teacher does not learn from them; expected --stage distil or mpo")
+        if not 0.0 < self.bag_share <= 1.0:
+            raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
 
 
 class _Parts:
@@ -155,25 +158,51 @@ class _Parts:
         return learner, self._replay(PrivilegedPlayer(self.task, policy, self.generator()), config.mpo)
 
     def _asymmetric(self) -> tuple[Learner[Any], Source[Any]]:
-        config, policy, options = self.config, self._camera(), self.options
+        config, policy = self.config, self._camera()
         learner = MPOLearner(policy, config.task.body, config.asymmetric, self.generator(), self.validation)
-        player, recorded, rows = ExploringPlayer(self.task, policy, self.generator()), None, 0
-        if options.bags:
-            rows = max(1, round(config.task.batch * options.bag_share / (1.0 - options.bag_share)))
-            rng = np.random.default_rng(next(self._streams))
-            recorded = BagTicks(options.bags, config.task, player.policy, rows, rng)
-        return learner, self._replay(player, config.asymmetric, recorded, rows)
+
+        def player() -> Player:
+            return ExploringPlayer(self.task, policy, self.generator())
+
+        return learner, self._replay_with_bags(player, policy, config.asymmetric)
 
     def _distil(self) -> tuple[Learner[Any], Source[Any]]:
         config, student = self.config, self._camera()
         assert config.teacher is not None
-        teacher = load_weights(PrivilegedPolicy, config.teacher).driver()
+        teacher = load_weights(PrivilegedPolicy, config.teacher)
         learner = DistilLearner(student, config.distil, self.generator(), self.validation)
-        player = DistilPlayer(self.task, student, teacher, config.distil, self.generator())
-        return learner, self._replay(player, config.distil)
+
+        def player() -> Player:
+            return DistilPlayer(self.task, student, teacher.driver(), config.distil, self.generator())
+
+        return learner, self._replay_with_bags(player, student, config.distil, teacher)
+
+    def _replay_with_bags(
+        self,
+        make_player: Callable[[], Player],
+        policy: VisuomotorController,
+        settings: MPOTrainingConfig | DistilConfig,
+        teacher: PrivilegedPolicy | None = None,
+    ) -> ReplaySource:
+        """Return the replay of what a player plays, of recorded ticks, or of both."""
+        options, batch = self.options, self.config.task.batch
+        if not options.bags:
+            return self._replay(make_player(), settings)
+        if options.bag_share == 1.0:
+            return self._replay(self._recorded(policy, batch, teacher), settings)
+        rows = max(1, round(batch * options.bag_share / (1.0 - options.bag_share)))
+        player = make_player()
+        return self._replay(player, settings, self._recorded(policy, rows, teacher), rows)
+
+    def _recorded(self, policy: VisuomotorController, rows: int, teacher: PrivilegedPolicy | None) -> BagPlayer:
+        own = VisuomotorController(**policy.config)
+        own.load_state_dict(policy.state_dict())
+        own.mixed_precision = policy.mixed_precision
+        rng = np.random.default_rng(next(self._streams))
+        return BagPlayer(BagTicks(self.options.bags, self.config.task, own, rows, rng, teacher), own)
 
     def _replay(
-        self, player: Player, settings: MPOTrainingConfig | DistilConfig, recorded: BagTicks | None = None,
+        self, player: Player, settings: MPOTrainingConfig | DistilConfig, recorded: Player | None = None,
         rows: int = 0,
     ) -> ReplaySource:  # fmt: skip
         width = self.config.task.batch + rows

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,20 +13,25 @@ import torch
 
 from bringup.rollout import Ending, Tick
 from bringup.rollout_recorder import Recorder
-from mujoban_controller.bag_ticks import TOPICS, BagTicks, episodes, transitions
+from mujoban_controller.bag_ticks import TOPICS, BagTicks, episodes, labels, transitions
 from mujoban_controller.controller import Recurrent, VisuomotorController
+from mujoban_controller.distil import DistilConfig
+from mujoban_controller.goal_features import feature_layout, goal_offsets
 from mujoban_controller.goal_settings import GoalTaskConfig, judging_config
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.mpo import MPOTrainingConfig
+from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, make_trainer
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import BALL, get_body
 from mujoban_core.grid import INSTRUCTION_LIMIT
 from mujoban_core.interfaces import Observation, TerminationOutput
 from mujoban_core.sense_plan_act import Decision
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
 from mujoban_msgs_py.bags.training import open_training_bag
+from mujoban_rl.testing import check_resuming
+from mujoban_rl.weights import save_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
@@ -52,6 +58,7 @@ def play_and_record(path, seed):
                 "features": task.features()[0], "side": task.side[0], "frame": inputs.frame[0],
                 "proprio": inputs.proprio[0], "instruction": int(inputs.instruction[0]),
                 "terminated": bool(inputs.terminated[0]), "action": torque[0],
+                "goal": goal_offsets(task.world)[0], "kind": task.world.goals.kind[0].copy(),
             })  # fmt: skip
             said = TerminationOutput(np.zeros(1, np.float32), inputs.terminated, np.array([failed]))
             pose = task.world.pose.copy()
@@ -111,16 +118,53 @@ def test_rows_go_on_from_episode_to_episode_and_know_the_policys_memory(recorded
         np.testing.assert_allclose(found[50][f"memory{i}"][0], values[0].numpy(), atol=1e-4)
 
 
+NETWORK = NetworkConfig(channels=(4, 8, 8), features=16, hidden=8)
+MPO = TrainConfig(
+    stage="mpo", steps=64, task=GoalTaskConfig(batch=4, difficulty=2), network=NETWORK,
+    asymmetric=MPOTrainingConfig(window=8, windows=2, sequence=8, replay=128, first=64, reuse=1.0),
+)  # fmt: skip
+
+
 def test_a_run_learns_from_bags_as_well(recorded, tmp_path):
-    config = TrainConfig(
-        stage="mpo", steps=64, task=GoalTaskConfig(batch=4, difficulty=2),
-        network=NetworkConfig(channels=(4, 8, 8), features=16, hidden=8),
-        asymmetric=MPOTrainingConfig(window=8, windows=2, sequence=8, replay=128, first=64, reuse=1.0),
-    )  # fmt: skip
-    trainer = make_trainer(Options(tmp_path, config, bags=(recorded[0],), bag_share=0.5, evaluation_episodes=0))
+    trainer = make_trainer(Options(tmp_path, MPO, bags=(recorded[0],), bag_share=0.5, evaluation_episodes=0))
     assert trainer.run()
     assert trainer.progress.samples == 64 and trainer.progress.updates > 2
     assert json.loads((tmp_path / "controller.json").read_text())["bags"] == [recorded[0].name]
+
+
+@pytest.fixture(params=["mpo", "distil"])
+def offline(request, recorded, tmp_path_factory, monkeypatch):
+    """Return what makes runs that learn from bags alone, in which nothing can be simulated."""
+    monkeypatch.setattr(GoalTask, "step", None)
+    config = MPO
+    if request.param == "distil":
+        teacher, policy = tmp_path_factory.mktemp("teacher") / "teacher.safetensors", PrivilegedPolicy()
+        save_weights(teacher, policy, policy.config, {})
+        distil = DistilConfig(window=4, windows=2, sequence=4, replay=64, first=16, reuse=0.5)
+        config = replace(MPO, stage="distil", teacher=teacher, distil=distil)
+
+    def make(path, steps=512, **changes):
+        options = {"bags": (recorded[0],), "bag_share": 1.0, "evaluation_episodes": 0, **changes}
+        return make_trainer(Options(path, replace(config, steps=steps), **options))
+
+    return make
+
+
+def test_runs_from_bags_alone_resume_to_the_bit(offline, tmp_path):
+    check_resuming(offline, tmp_path, stop_at=3, updates=6)
+
+
+def test_labels_are_what_the_teacher_would_have_done_with_the_side_ahead():
+    layout, rng = feature_layout(get_body("ant")), np.random.default_rng(0)
+    torch.manual_seed(0)
+    teacher = PrivilegedPolicy("ant")
+    fields = {"features": rng.normal(size=(20, layout.size)).astype(np.float32), "side": np.arange(20) % 4}
+    with torch.no_grad():
+        ahead = teacher(torch.from_numpy(fields["features"])).mean.clamp(-1.0, 1.0).numpy()
+    found = labels(teacher, fields)
+    np.testing.assert_array_equal(found[0], ahead[0])
+    np.testing.assert_array_equal(np.take_along_axis(found, layout.actuators[fields["side"]], 1), ahead)
+    assert not np.array_equal(found[1], ahead[1])
 
 
 def test_a_missing_topic_is_named_in_one_line(recorded, tmp_path):
@@ -145,5 +189,5 @@ def test_episodes_that_are_kept_for_tests_are_refused(tmp_path):
 
 
 def test_stages_that_would_not_learn_from_bags_refuse_them(recorded, tmp_path):
-    with pytest.raises(ValueError, match="expected --stage mpo"):
+    with pytest.raises(ValueError, match="expected --stage distil or mpo"):
         Options(tmp_path, TrainConfig(stage="teacher"), bags=(recorded[0],))
