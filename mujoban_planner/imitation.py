@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import start_from
 from mujoban_planner.lesson_source import LessonConfig, LessonSource
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch
 from mujoban_planner.validation import NetworkConfig, solve_rates
-from mujoban_rl.engine import Budget, Cadence, Learner, Trainer
+from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_rl.run_directory import RunDirectory
@@ -62,6 +63,15 @@ class ImitationConfig(LessonConfig, LearnerConfig):
     """Training time at which the cosine schedule ends, whichever of the two horizons comes first."""
     horizon_samples: float = 4e6
     """Samples at which the cosine schedule ends."""
+    bag_share: float = 0.25
+    """Share of a batch that comes from bags, where there are any; 1: all, and no lesson is made."""
+    bag_estimates: float = 0.8
+    """Share of these decisions that are shown as they were estimated, the others as they were."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no share."""
+        if not 0.0 < self.bag_share <= 1.0:
+            raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
 
 
 def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> tuple[Tensor, dict[str, Tensor]]:
@@ -160,8 +170,9 @@ class ImitationLearner(Learner[Batch]):
 
 
 def imitation(
-    config: ImitationConfig, directory: Path, cadence: Cadence | None = None, *, device: str = "cpu", processes: int = 1
-) -> Trainer[Batch]:
+    config: ImitationConfig, directory: Path, cadence: Cadence | None = None, *, device: str = "cpu",
+    processes: int = 1, bags: Sequence[Path] = (),
+) -> Trainer[Batch]:  # fmt: skip
     """Open or resume a run.
 
     Args:
@@ -170,14 +181,16 @@ def imitation(
         cadence: How often it evaluates and saves.
         device: Device of the network.
         processes: 1 to make lessons in a process beside, 0 to make them in between (a run is then deterministic).
+        bags: Recorded bags, or folders of bags, whose decisions are labelled and join the batches.
 
     Raises:
         RunError: If the directory belongs to another run.
+        BagError: If a bag is not what is expected.
     """
     run = RunDirectory(directory, config)
     learner = ImitationLearner(config, device)
-    player = copy.deepcopy(learner.average)
-    source = LessonSource(config, player, beside=run.path / "played.safetensors" if processes else None)
+    beside = run.path / "played.safetensors" if processes else None
+    source = _source(config, copy.deepcopy(learner.average), beside, bags)
     training = asdict(config)
     if math.isinf(config.horizon_seconds):
         training["horizon_seconds"] = None
@@ -185,7 +198,29 @@ def imitation(
         **provenance(),
         "method": "imitation",
         "training": training,
-        "data": "solver demonstrations and corrections of own play on generated levels, training seeds",
+        "data": _data(config, bags),
+        "bags": [bag.name for bag in bags],
     }
     budget = Budget(samples=config.horizon_samples, seconds=config.horizon_seconds)
     return Trainer(run, learner, source, budget, cadence, record=record)
+
+
+def _source(
+    config: ImitationConfig, player: LearnedPlanner, beside: Path | None, bags: Sequence[Path]
+) -> Source[Batch]:
+    """Return lessons, decisions from bags, or both."""
+    if not bags:
+        return LessonSource(config, player, beside)
+    recorded = round(config.bag_share * config.batch_size)
+    found = BagLessons(Lessons.read(bags, config.seed), max(recorded, 1), config.bag_estimates, config.seed)
+    if recorded >= config.batch_size:
+        return found
+    return LessonsAndBags(LessonSource(replace(config, batch_size=config.batch_size - recorded), player, beside), found)
+
+
+def _data(config: ImitationConfig, bags: Sequence[Path]) -> str:
+    lessons = "solver demonstrations and corrections of own play on generated levels, training seeds"
+    recorded = "decisions in bags, labelled by the solver"
+    if not bags:
+        return lessons
+    return recorded if config.bag_share == 1.0 else f"{lessons}; {recorded}"

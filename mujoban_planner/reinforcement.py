@@ -27,7 +27,7 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.teacher import DISCOUNT
 from mujoban_planner.validation import NetworkConfig, solve_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience
-from mujoban_rl.engine import Budget, Cadence, Learner, State, Trainer
+from mujoban_rl.engine import Budget, Cadence, Learner, Source, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
@@ -39,6 +39,7 @@ from mujoban_rl.weights import digest, provenance, save_weights
 
 _CLIP: Final = 40.0
 """Largest norm of the gradient."""
+_PLAYED: Final = "abstract environment on generated levels, training seeds"
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,12 @@ class MPOConfig(PlayConfig, NetworkConfig):
     q_weight: float = 0.5
     """Weight of the critic's loss."""
     bag_share: float = 0.25
-    """Share of a batch that comes from bags, where there are any."""
+    """Share of a batch that comes from bags, where there are any; 1: all, and nothing is played."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no share."""
+        if not 0.0 < self.bag_share <= 1.0:
+            raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
 
 
 class MPOBatch(NamedTuple):
@@ -106,10 +112,7 @@ class MoveStore:
         played = self._played(config.batch_size - from_bags)
         if self._bags is None or not from_bags:
             return played
-        extra = self._bags.sample(from_bags, self._generator)
-        bootstrap = config.discount * (~extra.terminated).float()
-        valid = torch.ones_like(extra.terminated)
-        recorded = MPOBatch(extra.state, extra.instruction, extra.reward, bootstrap, extra.next_state, valid)
+        recorded = recorded_batch(self._bags, from_bags, config.discount, self._generator)
         return MPOBatch._make(torch.cat(columns) for columns in zip(played, recorded, strict=True))
 
     def _played(self, count: int) -> MPOBatch:
@@ -129,6 +132,36 @@ class MoveStore:
         """Take over what `state` returned."""
         self._generator.set_state(state.part("own").tensors["generator"])
         self.replay.restore(state.part("replay"))
+
+
+def recorded_batch(bags: BagTransitions, count: int, discount: float, generator: torch.Generator) -> MPOBatch:
+    """Return random transitions of bags with returns of one step."""
+    found = bags.sample(count, generator)
+    bootstrap = discount * (~found.terminated).float()
+    valid = torch.ones_like(found.terminated)
+    return MPOBatch(found.state, found.instruction, found.reward, bootstrap, found.next_state, valid)
+
+
+class RecordedMoves(Source[MPOBatch]):
+    """Batches of recorded transitions, and of nothing else."""
+
+    def __init__(self, config: MPOConfig, bags: BagTransitions) -> None:
+        """Draw from `bags`."""
+        self._config, self._bags = config, bags
+        self._generator = torch.Generator().manual_seed(config.seed)
+
+    def next_batch(self) -> MPOBatch:
+        """Return a batch."""
+        self.samples += self._config.batch_size
+        return recorded_batch(self._bags, self._config.batch_size, self._config.discount, self._generator)
+
+    def state(self) -> State:
+        """Return what draws."""
+        return State(tensors={"generator": self._generator.get_state()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._generator.set_state(state.tensors["generator"])
 
 
 class MPOLearner(Learner[MPOBatch]):
@@ -233,21 +266,30 @@ def reinforcement(
     run = RunDirectory(directory, asdict(config) | {"init": origin})
     recorded = BagTransitions.read(bags) if bags else None
     learner = MPOLearner(config, device=device, init=init)
-    options = actors or ActorOptions()
-    place = device if options.actors in ("local", "threads") else "cpu"
-    pool = options.pool(partial(MoveActor, config, type(learner.network), learner.network.config, device=place))
-    source = ActorSource(
-        pool, MoveStore(config, recorded), steps_per_update=config.steps_per_update * config.environments,
-        first_steps=config.warm_up_steps * config.environments,
-    )  # fmt: skip
+    if recorded is not None and config.bag_share == 1.0:
+        source: Source[MPOBatch] = RecordedMoves(config, recorded)
+    else:
+        source = _played(config, learner.network, actors or ActorOptions(), device, recorded)
     record = {
         **provenance(),
         "method": "mpo",
         "training": asdict(config),
         "init": origin,
-        "data": "abstract environment on generated levels, training seeds" + (" and bags" if bags else ""),
+        "data": "bags" if isinstance(source, RecordedMoves) else _PLAYED + (" and bags" if bags else ""),
     }
     return Trainer(run, learner, source, Budget(), cadence, record=record)
+
+
+def _played(
+    config: MPOConfig, network: LearnedPlanner, options: ActorOptions, device: str, recorded: BagTransitions | None
+) -> Source[MPOBatch]:
+    """Return what actors play, beside the transitions of bags."""
+    place = device if options.actors in ("local", "threads") else "cpu"
+    pool = options.pool(partial(MoveActor, config, type(network), network.config, device=place))
+    return ActorSource(
+        pool, MoveStore(config, recorded), steps_per_update=config.steps_per_update * config.environments,
+        first_steps=config.warm_up_steps * config.environments,
+    )  # fmt: skip
 
 
 @torch.no_grad()

@@ -60,11 +60,15 @@ class Imitation(_Command):
     """Stop at so many samples; a later call resumes."""
     processes: int = 1
     """Processes that make lessons: 1, or 0 for a deterministic run."""
+    bags: tuple[Path, ...] = ()
+    """Recorded bags, or folders of bags, whose decisions join the lessons, labelled by the solver."""
     config: tyro.conf.OmitArgPrefixes[ImitationConfig] = field(default_factory=ImitationConfig)
 
     def main(self) -> None:
         """Train."""
-        trainer = imitation(self.config, self.run, self.cadence(), device=self.device, processes=self.processes)
+        trainer = imitation(
+            self.config, self.run, self.cadence(), device=self.device, processes=self.processes, bags=self.bags
+        )
         trainer.run(limit_seconds=self.seconds, limit_samples=self.samples)
 
 

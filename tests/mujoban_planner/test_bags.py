@@ -1,0 +1,87 @@
+"""What the planner learns from recorded bags: the decisions of a running stack, labelled by the solver or by reward."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from bringup.command import Choice, Stack
+from bringup.record import Job, MixedEpisodes, record
+from mujoban_core.plugins import ROLES
+from mujoban_msgs_py.bags import BagError
+from mujoban_planner.bag_lessons import BagLessons, Lessons
+from mujoban_planner.imitation import ImitationConfig, imitation
+from mujoban_planner.reinforcement import MPOConfig, reinforcement
+from mujoban_rl.testing import check_resuming
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.solver import solve_level
+
+
+def play_and_record(path, seed):
+    stack = Stack({role: Choice(role, "oracle") for role in ROLES})
+    assert record(Job(path, "", MixedEpisodes(1, seed, [1]), stack, None, 1, 400, 0))
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bags")
+    play_and_record(path, TRAIN_SEEDS.start)
+    return path
+
+
+def test_decisions_are_labelled_by_the_truth_and_shown_as_they_were_estimated(bags):
+    lessons = Lessons.read([bags], 0)
+    shown = (lessons.samples.right > 0) & lessons.estimated
+    assert shown.sum() == len(solve_level(generate_level(1, TRAIN_SEEDS.start)).moves)
+    # The oracle's estimates are the truth; here they are made less sure, to tell them from it.
+    doubtful = Lessons(
+        lessons.samples.take(shown), lessons.estimates[shown] * np.float16(0.75), lessons.estimated[shown]
+    )
+    as_estimated, as_it_was = (BagLessons(doubtful, 64, share, 0).next_batch() for share in (1.0, 0.0))
+    torch.testing.assert_close(as_estimated.state, 0.75 * as_it_was.state)
+    assert torch.equal(as_estimated.right, as_it_was.right) and bool(as_it_was.right.any(1).all())
+    assert len(as_it_was.state.unique(dim=0)) > shown.sum()  # the board is turned as well
+
+
+def test_levels_that_are_kept_for_tests_are_refused(tmp_path):
+    play_and_record(tmp_path, 5)
+    with pytest.raises(BagError, match="seed 5, which is kept for tests"):
+        Lessons.read([tmp_path], 0)
+
+
+def imitating(path, bags, share):
+    config = ImitationConfig(channels=8, blocks=1, batch_size=16, buffer=50_000, bag_share=share)
+    return imitation(config, path, processes=0, bags=[bags])
+
+
+def reinforced(path, bags, share):
+    config = MPOConfig(channels=8, blocks=1, environments=8, batch_size=8, target_period=2, bag_share=share)
+    return reinforcement(config, path, bags=[bags])
+
+
+@pytest.mark.parametrize("make", [imitating, reinforced])
+def test_runs_from_bags_alone_make_nothing_else_and_resume_to_the_bit(make, bags, tmp_path, monkeypatch):
+    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
+    for other in ("imitation.LessonSource", "reinforcement.MoveActor"):
+        monkeypatch.setattr(f"mujoban_planner.{other}", None)
+    check_resuming(lambda path: make(path, bags, 1.0), tmp_path, stop_at=3, updates=6)
+
+
+def test_lessons_and_bags_share_a_batch_and_resume_to_the_bit(bags, tmp_path, monkeypatch):
+    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
+    monkeypatch.setattr("mujoban_planner.lesson_source._STOCK_BATCHES", 2)
+    trainers = []
+
+    def make(path):
+        trainers.append(imitating(path, bags, 0.25))
+        return trainers[-1]
+
+    check_resuming(make, tmp_path, stop_at=2, updates=4)
+    assert trainers[0].progress.samples == 4 * 16
+
+
+def test_what_is_no_share_is_refused():
+    for config in (ImitationConfig, MPOConfig):
+        with pytest.raises(ValueError, match=r"--bag-share 1\.5"):
+            config(bag_share=1.5)
