@@ -33,6 +33,7 @@ class RecorderNode(Node):
     Parameters:
         path: Folder of the bag, which must not exist yet.
         episodes_per_file: Episodes after which the next file of the bag begins.
+        body, world: Of the robot and of the physics, which the bag names; empty: it does not.
 
     Attributes:
         counts: Messages that were never received, or belong to no tick of the simulator, by topic.
@@ -49,10 +50,12 @@ class RecorderNode(Node):
         fixed = ParameterDescriptor(read_only=True)
         path: Any = self.declare_parameter("path", "bag", fixed).value
         episodes_per_file = self.declare_parameter("episodes_per_file", 32, fixed).value
+        about = {name: str(self.declare_parameter(name, "", fixed).value) for name in ("body", "world")}
         self.counts: Counter[str] = Counter()
         self._bag = BagWriter(
-            Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file, flush_after=FLUSH_AFTER
-        )
+            Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file, flush_after=FLUSH_AFTER,
+            about={name: value for name, value in about.items() if value},
+        )  # fmt: skip
         self._ticks: dict[int, dict[str, bytes]] = {}
         self._last_ticks: set[int] = set()
         self.written = 0

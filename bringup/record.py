@@ -172,9 +172,9 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
         min(job.batch, len(job.episodes)), body=job.stack.body, world=job.world, time_limit=job.time_limit
     )
     difficulties = [job.episodes.difficulty(i) for i in range(len(job.episodes))]
-    recorder = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix)
+    recorder = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix, world=job.world)
     try:
-        for tick in ticks(policy, world, job.episodes, camera=True):
+        for tick in ticks(policy, world, job.episodes, camera=True, run_seed=job.seed):
             # Play may be cut short anywhere, but not a message.
             with StopSignal() as stop:
                 recorder.write(tick)

@@ -21,6 +21,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.topics import TICK, Topic
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.tick_messages import EpisodeProgress, SimulatorTick, TickComposer, TickLabel
 from mujoban_sokoban.episodes import EpisodeSpec
 
@@ -53,6 +54,7 @@ class Recorder:
         difficulties: Sequence[int],
         *,
         prefix: str = "",
+        world: str = DEFAULT_WORLD,
         episodes_per_file: int | None = 16,
     ) -> None:
         """Record into a folder.
@@ -63,11 +65,12 @@ class Recorder:
             episodes: Those that the ticks number.
             difficulties: Difficulty of each, 0 for levels from a file.
             prefix: Start of the bags' names, to tell recorders that share a folder apart.
+            world: The physical world, which the bags name.
             episodes_per_file: Episodes in one file of a bag; None: all.
         """
         self._path, self._prefix, self._episodes_per_file = path, prefix, episodes_per_file
         self._episodes, self._difficulties = episodes, difficulties
-        self._body = body
+        self._body, self._world = body, world
         self._rows: dict[int, _Row] = {}
         self.ticks = 0
         """Ticks written."""
@@ -93,8 +96,9 @@ class Recorder:
             if number not in self._rows:
                 path = self._path / f"{self._prefix}row{number:03d}"
                 writer = BagWriter(
-                    path, TOPICS, episodes_per_file=self._episodes_per_file, flush_after=FLUSH_AFTER
-                )
+                    path, TOPICS, episodes_per_file=self._episodes_per_file, flush_after=FLUSH_AFTER,
+                    about={"body": self._body.name, "world": self._world},
+                )  # fmt: skip
                 self._rows[number] = _Row(writer, TickComposer(self._body))
             self._write_row(self._rows[number], tick, m)
         self.ticks += len(tick.rows)

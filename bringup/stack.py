@@ -116,7 +116,7 @@ def play(
         stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:
-            listeners.append(graph.add(_recorder(options.record, options.episodes_per_file)))
+            listeners.append(graph.add(_recorder(options.record, options, stack.body)))
         if options.video is not None:
             listeners.append(graph.add(VideoNode(options.video)))
         if options.view:
@@ -166,6 +166,8 @@ def viewer() -> Iterator[None]:
         children.stop([process])
 
 
-def _recorder(path: Path, episodes_per_file: int) -> RecorderNode:
-    values = {"path": str(path), "episodes_per_file": episodes_per_file}
+def _recorder(path: Path, options: PlayOptions, body: str) -> RecorderNode:
+    values = {
+        "path": str(path), "episodes_per_file": options.episodes_per_file, "body": body, "world": options.world,
+    }  # fmt: skip
     return RecorderNode(parameter_overrides=[Parameter(name, value=value) for name, value in values.items()])

@@ -68,10 +68,12 @@ def make_trainer(options: Options) -> Trainer[Batch]:
     config = options.config
     torch.set_num_threads(options.threads)
     bags, validation = find_bags(options.bags), find_bags(options.validation)
+    worlds = set[str]()
     for path in (*bags, *validation):
         bag = open_training_bag(path, TOPICS, skip_damaged=options.skip_damaged)
         if path in bags and not options.allow_test_seeds:
             require_training_seeds(bag)
+        worlds.add(bag.about.get("world", "not stated"))
     learner = EstimatorLearner(config, device=options.device, validation=validation, out=options.out)
     if options.start is not None:
         learner.start_from(options.start)
@@ -84,6 +86,7 @@ def make_trainer(options: Options) -> Trainer[Batch]:
         **provenance(),
         "data": [p.name for p in options.bags],
         "bags": len(bags),
+        "world": ", ".join(sorted(worlds)),
         "training": asdict(config),
     }
     return Trainer(

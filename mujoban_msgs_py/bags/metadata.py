@@ -23,6 +23,8 @@ _BAG: Final = "mujoban_bag"
 """Key of `Metadata.bag` in the custom data."""
 _DIGEST: Final = "sha256/"
 """Beginning of the keys of the files' checksums in the custom data."""
+_ABOUT: Final = "mujoban/"
+"""Beginning of the keys of `Metadata.about` in the custom data."""
 _OWN_DIGEST: Final = "mujoban_sha256"
 """Key of the checksum of all else in the file."""
 _FOREVER: Final = {"sec": 9223372036, "nsec": 854775807}
@@ -84,6 +86,8 @@ class Metadata:
     compression_mode: str = ""
     bag: str = ""
     """What tells this bag from all others; empty for those of other writers."""
+    about: dict[str, str] = field(default_factory=dict)
+    """What was recorded, such as `world` and `body`."""
 
     def write(self, folder: Path) -> None:
         """Replace the file in `folder` atomically."""
@@ -115,6 +119,7 @@ class Metadata:
                 files=_files(information, custom),
                 compression_mode=_text(information.get("compression_mode") or "").lower(),
                 bag=_text(custom.get(_BAG, "")),
+                about={k.removeprefix(_ABOUT): _text(v) for k, v in custom.items() if k.startswith(_ABOUT)},
             )
         except (yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
             reason = " ".join(str(error).split())
@@ -141,7 +146,8 @@ class Metadata:
 
     def _custom(self) -> dict[str, str]:
         digests = {_DIGEST + file.path: file.digest for file in self.files if file.digest}
-        return digests | ({_BAG: self.bag} if self.bag else {})
+        about = {_ABOUT + name: value for name, value in self.about.items()}
+        return digests | about | ({_BAG: self.bag} if self.bag else {})
 
 
 # libyaml writes ten times as fast: a recording of many bags closes in the time that a user waits for.

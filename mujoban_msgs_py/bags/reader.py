@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -52,12 +52,16 @@ class Bag:
 
     Attributes:
         path: The bag.
+        about: What its recorder says of it, such as `world` and `body`; empty for those of others.
         incomplete: After `ticks`: messages that found no partner, by topic.
     """
 
-    def __init__(self, path: Path, storages: Sequence[Storage], doubts: Sequence[str] = ()) -> None:
+    def __init__(
+        self, path: Path, storages: Sequence[Storage], doubts: Sequence[str] = (),
+        about: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
         """Use `open_bag`."""
-        self.path = path
+        self.path, self.about = path, dict(about or {})
         self._doubts = tuple(doubts)
         self.incomplete: Counter[str] = Counter()
         self._storages = tuple(storages)
@@ -216,14 +220,14 @@ def open_bag(path: str | Path, *, damaged: Damage = "refuse") -> Bag:
             warnings.warn(f"{text}; `ros2 bag reindex` adds them", stacklevel=2)
         storages: list[Storage] = [SqliteBag(path, [path / file.path for file in listed])]
         _compare_counts(sum(file.count for file in listed), listed, storages[0], doubts)
-        return Bag(path, storages, doubts.noted)
+        return Bag(path, storages, doubts.noted, metadata.about)
     storages = []
     for file in listed:
         storage = _storage(path / file.path, damaged)
         storages.append(storage)
         if isinstance(storage, McapFile) and storage.complete:
             _compare_counts(file.count, [file], storage, doubts)
-    return Bag(path, storages, doubts.noted)
+    return Bag(path, storages, doubts.noted, metadata.about)
 
 
 class _Doubts:

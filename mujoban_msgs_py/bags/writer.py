@@ -41,6 +41,7 @@ class BagWriter:
         chunk_size: int = CHUNK_SIZE,
         compression: str = "zstd",
         flush_after: int | None = None,
+        about: Mapping[str, str] | None = None,
     ) -> None:
         """Make the bag's folder and open its first file.
 
@@ -52,6 +53,7 @@ class BagWriter:
             compression: Of chunks: "zstd", "lz4" or "" for none.
             flush_after: Different stamps after which a chunk is finished, which is all that a writer that is killed
                 can lose; None leaves it to the chunk's size.
+            about: What is recorded, for `Metadata.about`.
 
         Raises:
             BagError: If there is something at `path` already, or an option is out of its range.
@@ -67,7 +69,7 @@ class BagWriter:
         self._chunk_size = chunk_size
         self._compression = _COMPRESSION[compression]
         self._types = TypeRegistry()
-        self._metadata = Metadata(bag=secrets.token_hex(16))
+        self._metadata = Metadata(bag=secrets.token_hex(16), about=dict(about or {}))
         self._flush_after = flush_after
         self._stamps: set[int] = set()
         self._episodes = 0

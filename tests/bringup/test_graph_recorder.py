@@ -16,6 +16,7 @@ from mujoban_msgs_py.bags import BagError, open_bag
 from mujoban_msgs_py.conversions import stamp_of
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, SIMULATOR_TOPICS, TICK
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
@@ -68,6 +69,8 @@ def test_the_graph_and_the_rollout_record_the_same_of_an_episode(oracles, tmp_pa
     with Recorder(tmp_path, world.body, episodes, [1, 1]) as recorder:
         for tick in ticks(oracles.policy(), world, episodes, camera=True):
             recorder.write(tick)
+    assert open_bag(tmp_path / "graph").about == open_bag(tmp_path / "row000").about
+    assert open_bag(tmp_path / "graph").about == {"body": "ball", "world": DEFAULT_WORLD}
     graph, rollout = said(tmp_path / "graph"), said(tmp_path / "row000")
     for topic in graph:
         assert graph[topic] == rollout[topic], topic
