@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,7 +23,7 @@ from mujoban_core.program import USAGE_ERROR
 from mujoban_estimator.node import EstimatorNode
 from mujoban_estimator.termination_node import TerminationNode
 from mujoban_msgs_py.runtime.module_node import ModuleNode
-from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
+from mujoban_msgs_py.runtime.shared_memory import RunFolder, clear_shared_memory
 from mujoban_planner.node import PlannerNode
 from mujoban_sim.node import SimulatorNode
 
@@ -47,6 +46,12 @@ RESTART_LIMIT = 20
 
 class GraphError(ValueError):
     """A node of the graph could not start; it has said why."""
+
+
+def keep_memories(parameters: Parameters, folder: Path) -> None:
+    """Have each node keep in a folder what it needs to go on from where it was, when it is started again."""
+    for name in NODES:
+        parameters[name]["resume_file"] = str(folder / f"{name}.safetensors")
 
 
 class InProcess:
@@ -128,11 +133,9 @@ class Processes:
         """
         self._restart_limit = restart_limit
         self.restarts: Counter[str] = Counter()
-        self._directory = tempfile.TemporaryDirectory(prefix="mujoban-")
-        folder = Path(self._directory.name)
-        # A simulator that is started again has to know where it was.
-        parameters["simulator"]["resume_file"] = str(folder / "moment.safetensors")
-        self._parameter_file = folder / "parameters.yaml"
+        self._folder = RunFolder()
+        keep_memories(parameters, self._folder.path)
+        self._parameter_file = self._folder.path / "parameters.yaml"
         write_parameters(parameters, self._parameter_file)
         self._children = {name: self._start(name) for name in NODES}
 
@@ -170,7 +173,7 @@ class Processes:
         """End all processes."""
         if children.stop(self._children.values()):
             clear_shared_memory()
-        self._directory.cleanup()
+        self._folder.remove()
 
     def _start(self, name: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", NODES[name].__module__, "--ros-args"]

@@ -25,11 +25,7 @@ class ControllerNode(ModuleNode):
         Input(topics.PROPRIO, conversions.body_proprio_from_msg),
         Input(topics.TERMINATION, conversions.termination_from_msg),
     )
-
-    def __init__(self, **options: Any) -> None:
-        """Load the module and start listening."""
-        super().__init__(**options)
-        self._publisher = self.create_output(topics.TORQUE)
+    output = topics.TORQUE
 
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
         """Act for one tick."""

@@ -22,11 +22,7 @@ class EstimatorNode(ModuleNode):
         Input(topics.CAMERA, conversions.frame_from_msg),
         Input(topics.POSE, conversions.pose_from_msg),
     )
-
-    def __init__(self, **options: Any) -> None:
-        """Load the module and start listening."""
-        super().__init__(**options)
-        self._publisher = self.create_output(topics.ABSTRACT_STATE)
+    output = topics.ABSTRACT_STATE
 
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
         """Estimate the abstract state of one tick."""

@@ -44,22 +44,20 @@ class TerminationNode(ModuleNode):
         Input(topics.CAMERA, conversions.frame_from_msg),
         Input(topics.PROPRIO, conversions.body_proprio_from_msg),
     )
+    output = topics.TERMINATION
 
     def __init__(self, **options: Any) -> None:
         """Load the module and start listening."""
         super().__init__(**options)
-        self._publisher = self.create_output(topics.TERMINATION)
-        self._terminated = False
         self._said: dict[int, conversions.InstructionReading] = {}
         for name, descriptor in _SETTINGS.items():
             setattr(self.module, name, self.declare_parameter(name, getattr(self.module, name), descriptor).value)
         check_termination(limit=self.module.limit, threshold=self.module.threshold)
         listen(self, topics.INSTRUCTION, self._on_instruction)
 
-    def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
-        """Start the state and forget the instructions of the episode before."""
-        super().begin(episode, inputs)
-        self._terminated = False
+    def initial_state(self, number: int) -> Any:
+        """Return the module's state and beta_{t-1}, [1]."""
+        return super().initial_state(number), np.zeros(1, np.bool_)
 
     def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
         """Wait for A_{t-1}, unless this node has only just joined the episode."""
@@ -72,17 +70,18 @@ class TerminationNode(ModuleNode):
         """Classify one tick."""
         previous = self._previous(conversions.stamp_of(episode)) if episode.step > 0 else None
         direction = NO_INSTRUCTION if previous is None else previous.direction
-        beta, self.state = self.module.step(
+        state, terminated = self.state
+        beta, state = self.module.step(
             TerminationInput(
                 inputs[topics.CAMERA.name][None],
                 inputs[topics.PROPRIO.name][None],
                 np.array([direction], np.int64),
-                np.array([self._terminated]),
+                terminated,
                 truth,
             ),
-            self.state,
+            state,
         )
-        self._terminated = bool(beta.terminated[0])
+        self.state = state, beta.terminated
         message = conversions.termination_to_msg(
             episode.header,
             0 if previous is None else previous.sequence,

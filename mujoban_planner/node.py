@@ -30,6 +30,7 @@ class PlannerNode(ModuleNode):
         Input(topics.ABSTRACT_STATE, conversions.abstract_state_from_msg),
         Input(topics.TERMINATION, conversions.termination_from_msg),
     )
+    output = topics.INSTRUCTION
     truth_inputs = ()
     """A planner, also the oracle, goes by the abstract state that it is given."""
 
@@ -37,7 +38,6 @@ class PlannerNode(ModuleNode):
         """Load the module and start listening."""
         self._look_ahead: int | None = None
         super().__init__(**options)
-        self._publisher = self.create_output(topics.INSTRUCTION)
 
     def prepare(self, module: Any) -> Any:
         """Let the planner look ahead, if it is to."""

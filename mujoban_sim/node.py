@@ -21,12 +21,13 @@ from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
+from mujoban_msgs_py.runtime.kept import KeptArrays
 from mujoban_msgs_py.runtime.pace import Pace
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.observation import ObservationPublisher
 from mujoban_sim.presets import DEFAULT_WORLD
-from mujoban_sim.resume import Moment, MomentFile, Place
+from mujoban_sim.resume import Moment, Place
 from mujoban_sim.tick_messages import TickLabel
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
@@ -118,7 +119,7 @@ class SimulatorNode(Node):
         self._destroyed = False
         self._started: float | None = None
         path = self._settings["resume_file"]
-        self._file = MomentFile(Path(path)) if path else None
+        self._kept = KeptArrays(Path(path)) if path else None
         self._resumed = self._restore()
         # What is missing to draw with shows now, and the first tick is as quick as the others.
         self.world.render()
@@ -187,7 +188,7 @@ class SimulatorNode(Node):
 
     def _restore(self) -> bool:
         """Take up the moment that an earlier process has left, or the first episode; return whether there was one."""
-        moment = None if self._file is None else self._file.read()
+        moment = None if self._kept is None else self._kept.read(Moment.of)
         if moment is None:
             self.world.reset([0], [self.episodes[0]])
             return False
@@ -197,8 +198,9 @@ class SimulatorNode(Node):
         return True
 
     def _keep(self) -> None:
-        if self._file is not None:
-            self._file.write(Moment(self._place, self._held_torque, dict(self.world.snapshot([0]))))
+        if self._kept is not None:
+            moment = Moment(self._place, self._held_torque, dict(self.world.snapshot([0])))
+            self._kept.write(moment.arrays(), self)
 
     # Ticks
 

@@ -9,8 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 from mujoban_msgs.msg import Episode
+from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 
 from mujoban_core.interfaces import GroundTruth, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, look_around
@@ -18,10 +20,14 @@ from mujoban_core.plugins import LEARNED, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import described
+from mujoban_msgs_py.runtime.kept import KeptArrays, leaves, with_leaves
 from mujoban_msgs_py.runtime.tick_node import Input, Output, TickNode
+from mujoban_msgs_py.topics import Topic
 
 MOST_TICKS = 1_000_000
 """Upper end of ranges of ticks, which have none of their own."""
+_PLACE, _ANSWER, _LEAF = "place", "answer", "state."
+"""Keys of what a node keeps: the number of the episode and the stamp of the tick; its answer; arrays of the state."""
 TRUTH_INPUTS = (
     Input(topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_from_msg),
     Input(topics.TRUE_POSE, conversions.pose_from_msg),
@@ -46,17 +52,20 @@ class ModuleNode(TickNode):
         run_seed: Seed of the module's random streams, one for each number of an episode; fixed when the node starts.
         look_around: Of planner and controller alone: ticks of a look, which is a turn on the spot; 0 for none. Fixed
             when the node starts.
+        resume_file: Where the node keeps what it remembers after every tick, so that it goes on from there after it was
+            killed; empty means nowhere. Fixed when the node starts.
     """
 
     role: ClassVar[str]
     inputs: ClassVar[Sequence[Input]]
+    output: ClassVar[Topic]
     truth_inputs: ClassVar[Sequence[Input]] = TRUTH_INPUTS
 
     def __init__(self, **options: Any) -> None:
         """Load the module and start listening.
 
         Raises:
-            ValueError: If the module or its weights cannot be loaded.
+            ValueError: If the module or its weights cannot be loaded, or `resume_file` is none.
         """
         super().__init__(self.role, **options)
         threads: Any = self.declare_parameter("threads", 1, described("of PyTorch", fixed=True)).value
@@ -79,6 +88,12 @@ class ModuleNode(TickNode):
         self._episode = -1
         self.add_on_set_parameters_callback(self._on_parameters)
         self._truth = self.truth_inputs if self.module.privileged else ()
+        self._publisher = self.create_output(self.output)
+        about = described("file of what the node remembers, to go on from after a crash; empty: none", fixed=True)
+        resume_file: Any = self.declare_parameter("resume_file", "", about).value
+        self._kept = KeptArrays(Path(resume_file)) if resume_file else None
+        if self._kept is not None:
+            self._kept.read(self._resume)
         self.open_inputs([*self.inputs, *self._truth])
 
     @abstractmethod
@@ -87,19 +102,41 @@ class ModuleNode(TickNode):
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
         """Start `self.state` at the first tick that the module sees of an episode."""
-        self.state = self.module.initial_state(module_seeds(self._run_seed, np.array([episode.episode])))
+        self.state = self.initial_state(episode.episode)
+
+    def initial_state(self, number: int) -> Any:
+        """Return what the node remembers at the start of an episode of a number: any nesting of tuples of arrays."""
+        return self.module.initial_state(module_seeds(self._run_seed, np.array([number])))
 
     def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
         """Step the module; an episode's last tick needs no answer."""
         if episode.ended:
             return ()
-        if self.state is None or episode.episode != self._episode:
+        if self.state is None or episode.episode != self._episode or episode.step == 0:
             self._episode = episode.episode
             self.begin(episode, inputs)
         truth = None
         if self._truth:
             truth = GroundTruth(*(np.asarray(inputs[i.topic.name])[None] for i in self._truth))
         return self.step(episode, inputs, truth)
+
+    def keep(self, stamp: int, outputs: Sequence[Output]) -> None:
+        """Keep the answer and the state for the process that comes after this one."""
+        if self._kept is None or self.state is None:
+            return
+        arrays: dict[str, Any] = {f"{_LEAF}{i}": leaf for i, leaf in enumerate(leaves(self.state))}
+        arrays[_PLACE] = np.array([self._episode, stamp])
+        arrays[_ANSWER] = np.frombuffer(b"".join(serialize_message(o.message) for o in outputs), np.uint8)
+        self._kept.write(arrays, self)
+
+    def _resume(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Take up what `keep` has kept; a KeyError or ValueError says that it is not that of such a module."""
+        number, stamp = arrays[_PLACE].tolist()
+        answer = arrays[_ANSWER].tobytes()
+        kept = (arrays[f"{_LEAF}{i}"] for i in range(len(arrays) - 2))
+        self.state = with_leaves(self.initial_state(number), kept)
+        self._episode = number
+        self.take_up(stamp, [Output(self._publisher, answer)] if answer else ())
 
     def _load(self, weights: str, device: str) -> Any:
         module = load_module(self.role, self._source, Path(weights) if weights else None, device)

@@ -1,20 +1,64 @@
-"""Shared memory that Fast DDS has left behind where a process was killed."""
+"""Shared memory: what the processes of a run leave each other there, and what those that were killed left."""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import re
+import shutil
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 FOLDER: Final = Path("/dev/shm")
 _SEGMENT: Final = re.compile(r"(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?")
+_RUN: Final = "mujoban-run-"
+"""Begins the name of a run's folder."""
+
+
+class RunFolder:
+    """A folder of this user for the processes of a run, in memory: what they write in every tick costs no disk.
+
+    It is held by a lock, which ends with this process; `clear_shared_memory` removes those that nobody holds.
+
+    Attributes:
+        path: The folder.
+    """
+
+    def __init__(self, parent: Path = FOLDER) -> None:
+        """Make it in shared memory, or among the temporary files where there is none."""
+        if not os.access(parent, os.W_OK | os.X_OK):
+            parent = Path(tempfile.gettempdir())
+        self._lock = -1
+        while self._lock < 0:
+            self.path = Path(tempfile.mkdtemp(prefix=_RUN, dir=parent))
+            self._lock = _lock(self.path)
+
+    def remove(self) -> None:
+        """Remove it with all that is in it."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        os.close(self._lock)
+
+
+def _lock(folder: Path) -> int:
+    """Return the descriptor that holds a folder until it is closed; -1 if somebody else holds or has removed it."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except OSError:
+        return -1
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(descriptor).st_ino == folder.lstat().st_ino:
+            return descriptor
+    except OSError:
+        pass
+    os.close(descriptor)
+    return -1
 
 
 def clear_shared_memory(folder: Path = FOLDER) -> list[str]:
-    """Remove this user's segments and ports of Fast DDS that no process holds; return the names of the files.
+    """Remove this user's segments and ports of Fast DDS, and runs' folders, that no process holds; return their names.
 
     A segment in use is held by a lock on the file beside it, which Fast DDS itself goes by (`fastdds shm clean`). It
     may be without that file for a moment; so what any process has open or has mapped is left alone as well.
@@ -32,6 +76,11 @@ def clear_shared_memory(folder: Path = FOLDER) -> list[str]:
             for file in files:
                 file.unlink(missing_ok=True)
                 removed.append(file.name)
+    for run in filter(_is_own, sorted(folder.glob(f"{_RUN}*"))):
+        if (lock := _lock(run)) >= 0:
+            shutil.rmtree(run, ignore_errors=True)
+            os.close(lock)
+            removed.append(run.name)
     return removed
 
 

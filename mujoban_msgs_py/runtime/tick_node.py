@@ -38,8 +38,9 @@ from mujoban_msgs_py.topics import EPISODE, Topic
 
 _DEADLINE = 3600.0
 """Seconds after which a wait begins anew."""
-PATIENCE = 2
-"""Repeated offers of a tick after which a node answers without what it still waits for."""
+PATIENCE = 20
+"""Repeated offers of a tick after which a node answers without what it still waits for: one that was killed is back by
+then, and has said it."""
 
 
 class Input(NamedTuple):
@@ -119,6 +120,19 @@ class TickNode(Node):
         """Return a publisher of a topic."""
         return self.create_publisher(topic.type, topic.name, topic.qos)
 
+    def keep(self, stamp: int, outputs: Sequence[Output]) -> None:
+        """Note that a tick is answered, before anybody else knows; `take_up` goes on from there."""
+
+    def take_up(self, stamp: int, outputs: Sequence[Output]) -> None:
+        """Go on after the tick that another process had answered last, and say its answer again to who has missed it.
+
+        Args:
+            stamp: Of the tick.
+            outputs: The answer, with messages as they are or serialised.
+        """
+        self._handled, self._outputs = stamp, outputs
+        self._publish()
+
     def retry(self) -> None:
         """Ask `answer` again about the tick that it could not answer yet."""
         if self._open is None or self._destroyed:
@@ -130,6 +144,7 @@ class TickNode(Node):
             return
         self._open, self._handled, self._outputs = None, stamp, outputs
         self._answered += 1
+        self.keep(stamp, outputs)
         self._publish()
 
     def _receive(self, topic: Topic, decode: Callable[[Any], Any] | None, message: bytes) -> None:

@@ -11,7 +11,7 @@ from mujoban_msgs.msg import EpisodeTruth, Instruction
 from rclpy.node import Node
 
 from bringup.command import Choice, Stack
-from bringup.graph import NODES, InProcess
+from bringup.graph import NODES, InProcess, keep_memories
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_core.plugins import ROLES
@@ -58,9 +58,11 @@ class Tap(Node):
 class Play:
     """A running graph."""
 
-    def __init__(self, stack: Stack, episodes: Episodes, names=NODES, **simulator):
+    def __init__(self, stack: Stack, episodes: Episodes, names=NODES, memories=None, **simulator):
         simulator.setdefault("resend_after", 0.2)
         self.parameters = graph_parameters(stack, episodes, **simulator)
+        if memories is not None:
+            keep_memories(self.parameters, memories)
         self.graph = InProcess(self.parameters, ())
         self._open = True
         self.tap = self.graph.add(Tap())

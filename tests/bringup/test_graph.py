@@ -1,8 +1,10 @@
 """What the graph bears: nodes that die, services, bad input, a clock that does not wait, weights that change."""
 
+import errno
 import re
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from safetensors.numpy import save
 from sensor_msgs.msg import Image, JointState
 from std_srvs.srv import SetBool, Trigger
 
@@ -63,11 +66,45 @@ def test_a_simulator_that_is_killed_goes_on_at_the_same_tick_as_if_nothing_had_h
     assert [e.episode for e in graph.said.episodes.values()] == [e.episode for e in undisturbed.said.episodes.values()]
 
 
-def test_a_file_that_is_no_moment_of_a_run_is_named(play_graph, tmp_path):
-    file = tmp_path / "moment.safetensors"
-    file.write_bytes(b"nothing")
-    with pytest.raises(ValueError, match=r"moment\.safetensors: expected the moment of a run"):
-        play_graph(resume_file=str(file))
+def test_modules_that_are_killed_go_on_from_what_they_remember_as_if_nothing_had_happened(
+    play_graph, fresh_weights, tmp_path
+):
+    stack = Stack(fresh_weights.choices | {"planner": Choice("planner")}, look_around=5)
+    episodes = Episodes(2, 5, difficulty=3)
+    undisturbed = play_graph(stack, episodes, time_limit=40)
+    expected = undisturbed.finish()
+    undisturbed.__exit__(None, None, None)
+    graph = play_graph(stack, episodes, time_limit=40, memories=tmp_path)
+    for ticks, names in ((8, MODULES[:1]), (16, MODULES[1:2]), (24, MODULES[2:3]), (32, MODULES[3:]), (60, MODULES)):
+        graph.spin_until(lambda ticks=ticks: len(graph.said.torque) >= ticks)
+        for name in names:
+            graph.graph.stop(name)
+        for name in names:
+            graph.graph.start(name)
+    assert graph.finish() == expected
+    assert graph.said.instruction == undisturbed.said.instruction
+    assert graph.said.torque == undisturbed.said.torque
+
+
+def test_a_node_whose_disk_is_full_works_on_without_a_memory_to_go_on_from(play_graph, tmp_path, monkeypatch):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1), memories=tmp_path)
+    graph.spin_until(lambda: graph.simulator.ticks >= 5)
+    assert {file.stem for file in tmp_path.iterdir()} == set(NODES)
+
+    def full(self, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    (result,) = graph.finish()
+    assert result.solved and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["simulator", "termination"])
+@pytest.mark.parametrize("data", [b"nothing", save({"place": np.zeros(2, np.int64), "answer": np.zeros(0, np.uint8)})])
+def test_a_file_that_a_node_has_not_kept_is_named(play_graph, tmp_path, name, data):
+    (tmp_path / f"{name}.safetensors").write_bytes(data)
+    with pytest.raises(ValueError, match=rf"{name}\.safetensors: expected what this node has kept: "):
+        play_graph(memories=tmp_path, names=[name])
 
 
 def test_every_node_says_on_diagnostics_how_it_is(play_graph):

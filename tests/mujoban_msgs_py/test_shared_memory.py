@@ -2,8 +2,10 @@
 
 import fcntl
 import os
+import subprocess
+import sys
 
-from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
+from mujoban_msgs_py.runtime.shared_memory import RunFolder, clear_shared_memory
 
 SEGMENT = "fastrtps_0123456789abcdef"
 
@@ -21,3 +23,16 @@ def test_only_what_nobody_holds_is_removed(tmp_path):
     assert sorted(removed) == sorted(left)
     kept = [held, f"{held}_el", "fastrtps_port7412", "fastrtps_x", "psm_0123"]
     assert sorted(os.listdir(tmp_path)) == kept
+
+
+def test_the_folder_of_a_run_that_was_killed_is_removed_and_that_of_one_that_lives_is_not(tmp_path):
+    code = "import sys; from mujoban_msgs_py.runtime.shared_memory import *; r = RunFolder(Path(sys.argv[1])); "
+    code += "os.kill(os.getpid(), 9)"
+    assert subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False).returncode == -9
+    lives = RunFolder(tmp_path)
+    (lives.path / "kept").write_text("memory")
+    (orphan,) = set(tmp_path.iterdir()) - {lives.path}
+    assert clear_shared_memory(tmp_path) == [orphan.name]
+    assert (lives.path / "kept").exists()
+    lives.remove()
+    assert not list(tmp_path.iterdir())
