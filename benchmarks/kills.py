@@ -105,9 +105,10 @@ def disturbed(options: Options, mode: Mode) -> tuple[list[EpisodeResult], dict[s
         init_ros()
         exits.callback(rclpy.try_shutdown)
         graph = exits.enter_context(InProcess(parameters, ()))
-        monitor = graph.add(MonitorNode(len(episodes)))
+        monitor = graph.add(MonitorNode(episodes))
         kills = options.kills * len(options.nodes)
         processes = exits.enter_context(Processes(parameters, restart_limit=kills))
+        monitor.watch.ghosts = processes.ghosts
         killer = Killer(options, processes, monitor)
         monitor.create_timer(RESPAWN_PERIOD, processes.supervise)
         monitor.create_timer(_PERIOD, killer.look)

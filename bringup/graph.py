@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,6 +23,7 @@ from mujoban_core import children
 from mujoban_core.program import USAGE_ERROR
 from mujoban_estimator.node import EstimatorNode
 from mujoban_estimator.termination_node import TerminationNode
+from mujoban_msgs_py.listening import LEASE
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.shared_memory import RunFolder, clear_shared_memory
 from mujoban_planner.node import PlannerNode
@@ -133,6 +135,7 @@ class Processes:
         """
         self._restart_limit = restart_limit
         self.restarts: Counter[str] = Counter()
+        self._ends: list[tuple[float, str]] = []
         self._folder = RunFolder()
         keep_memories(parameters, self._folder.path)
         self._parameter_file = self._folder.path / "parameters.yaml"
@@ -167,7 +170,18 @@ class Processes:
                 times = self._restart_limit + 1
                 raise GraphError(f"the {name} node has ended {times} times, with status {status} at last")
             self.restarts[name] += 1
+            self._ends.append((time.monotonic(), name))
             self._children[name] = self._start(name)
+
+    def counts(self) -> Counter[str]:
+        """Return how often which node was started again."""
+        return Counter({f"{name}: restarts": n for name, n in self.restarts.items()})
+
+    def ghosts(self, name: str) -> int:
+        """Return how many processes of a node have ended so lately that others may still take them for alive."""
+        now = time.monotonic()
+        self._ends = [(ended, node) for ended, node in self._ends if now - ended < LEASE]
+        return sum(node == name for _, node in self._ends)
 
     def stop(self) -> None:
         """End all processes."""

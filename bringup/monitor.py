@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from mujoban_msgs.msg import EpisodeTruth
@@ -17,10 +17,13 @@ from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
-from mujoban_msgs_py.listening import PublisherWatch, Received, listen
+from mujoban_msgs_py.listening import LOG_PERIOD, PublisherWatch, Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
+from mujoban_sokoban.episodes import Episodes
 
+ANOTHER_RUN: Final = "messages of another run"
+"""Kind under which `MonitorNode.counts` has what was refused."""
 _WATCHED = (topics.INSTRUCTION, topics.TERMINATION, topics.ABSTRACT_STATE, topics.TRUE_ABSTRACT_STATE)
 
 
@@ -63,8 +66,8 @@ class MonitorNode(Node):
         counts: Events that a user should know of.
     """
 
-    def __init__(self, episodes: int, **options: Any) -> None:
-        """Watch until so many episodes have ended."""
+    def __init__(self, episodes: Episodes, **options: Any) -> None:
+        """Watch until as many episodes have ended; what another run says of its own is no result of this one."""
         super().__init__("monitor", **options)
         self.episode: EpisodeTruth | None = None
         self.latest: Watched | None = None
@@ -107,6 +110,14 @@ class MonitorNode(Node):
 
     def _on_episode(self, received: Received) -> None:
         message: EpisodeTruth = received.content
+        if message.seed not in self._episodes.seeds or message.difficulty != self._episodes.difficulty:
+            self.counts[ANOTHER_RUN] += 1
+            self.get_logger().error(
+                f"another run is in this ROS domain: it plays seed {message.seed} at difficulty {message.difficulty}, "
+                "which is none of this run's",
+                throttle_duration_sec=LOG_PERIOD,
+            )
+            return
         if self._end is not None and message.episode == self._end.episode:
             # The episode goes on, so that its end was not the simulator's word.
             if message.header.stamp != self._end.header.stamp:
@@ -148,5 +159,5 @@ class MonitorNode(Node):
                 solved=end.solved, steps=end.step, episode_return=end.episode_return, last=self.latest.truth
             )
         )
-        if len(self.results) == self._episodes:
+        if len(self.results) == len(self._episodes):
             self.finished.set_result(None)

@@ -112,7 +112,7 @@ def play(
         graph = exits.enter_context(InProcess(parameters, () if options.processes else NODES))
         for role in () if options.processes else ROLES:
             check_body(role, graph.nodes[role].module, stack.body)  # pyright: ignore[reportAttributeAccessIssue]
-        monitor = graph.add(MonitorNode(len(episodes)))
+        monitor = graph.add(MonitorNode(episodes))
         stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:
@@ -123,6 +123,7 @@ def play(
             exits.enter_context(viewer())
         if options.processes:
             processes = exits.enter_context(Processes(parameters))
+            monitor.watch.ghosts = processes.ghosts
             monitor.create_timer(RESPAWN_PERIOD, lambda: _supervise(processes, monitor))
         if on_refresh is not None:
             monitor.create_timer(refresh_period, lambda: on_refresh(monitor, monitor.results))
@@ -131,7 +132,8 @@ def play(
         if on_refresh is not None:  # a short run may have ended before the first refresh
             on_refresh(monitor, monitor.results)
         _drain(graph.executor, listeners, monitor.stamp)
-        counts = processes.restarts if options.processes else graph.counts()
+        counts = processes.counts() if options.processes else graph.counts()
+        counts += Counter({f"monitor: {kind}": n for kind, n in monitor.counts.items()})
         return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts)
 
 

@@ -2,13 +2,13 @@
 
 A graph is open: whoever shares its domain can publish on its topics. A message that is not what its topic carries is
 dropped, counted and named by its topic; what passes is sound, but may still come from somebody who does not belong to
-the graph: `foreign_publishers` names them.
+the graph: `PublisherWatch` names them.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -28,6 +28,11 @@ WATCH_PERIOD: Final = 1.0
 """Seconds between two looks at who publishes."""
 _THOROUGH: Final = 10
 """Of so many looks one asks for every publisher's name, which takes 20 ms; the others count them."""
+LEASE: Final = 30.0
+"""Seconds for which the publishers of a process that was killed are known at most: Fast DDS gives 20, and looks."""
+_NAMELESS: Final = "_NODE_NAMESPACE_UNKNOWN_/_NODE_NAME_UNKNOWN_"
+_PATIENCE: Final = 5
+"""Looks in a row for which a publisher may be without a name."""
 REJECTED: Final = "rejected messages"
 """Kind under which `Listener.counts` has what was dropped."""
 
@@ -97,26 +102,16 @@ def _count(node: Node, kind: str) -> None:
         counts[kind] += 1
 
 
-def foreign_publishers(node: Node, topics: Iterable[str] = PUBLISHERS) -> set[tuple[str, str]]:
-    """Return (topic, node) of every publisher that has no business on a topic of the graph.
-
-    Args:
-        node: Any node of the domain.
-        topics: Names of topics of the graph.
-    """
-    return {
-        (topic, f"{info.node_namespace.rstrip('/')}/{info.node_name}")
-        for topic in topics
-        for info in node.get_publishers_info_by_topic(topic)
-        if (info.node_namespace, info.node_name) != ("/", PUBLISHERS[topic])
-    }
-
-
 class PublisherWatch:
     """Names those who publish on a graph's topics and do not belong to it, once each.
 
+    A topic of the graph has one publisher, the node of `topics.PUBLISHERS`: who has another name does not belong to the
+    run, nor does a second one of that name, which is of another run or was started by hand.
+
     Attributes:
         seen: (topic, node) of all that were named.
+        ghosts: Tells how many publishers a node may have on a topic besides the one that lives: those of processes that
+            were killed stay known for `LEASE` seconds.
     """
 
     def __init__(self, node: Node) -> None:
@@ -124,25 +119,43 @@ class PublisherWatch:
         self._node = node
         self._looks = 0
         self._counts: dict[str, int] = {}
+        self._nameless: Counter[str] = Counter()
         self.seen: set[tuple[str, str]] = set()
+        self.ghosts: Callable[[str], int] = lambda name: 0
         node.create_timer(WATCH_PERIOD, self.look)
 
     def look(self) -> None:
         """Report who has come since the last look."""
-        new = foreign_publishers(self._node, self._topics()) - self.seen
+        new = {(topic, name) for topic in self._topics() for name in self._foreign(topic)} - self.seen
         self.seen |= new
         for name in sorted({name for _, name in new}):
             _count(self._node, "foreign publishers")
             their = ", ".join(sorted(f"{topic} (of /{PUBLISHERS[topic]})" for topic, n in new if n == name))
+            second = "a second " if all(name == f"/{PUBLISHERS[topic]}" for topic, n in new if n == name) else ""
             self._node.get_logger().error(
-                f"foreign publisher: node {name} publishes on {their}; the run may be disturbed. Stop it, or give it "
-                "another ROS_DOMAIN_ID"
+                f"foreign publisher: {second}node {name} publishes on {their}; the run may be disturbed. Stop it, or "
+                "give it another ROS_DOMAIN_ID"
             )
 
+    def _foreign(self, topic: str) -> set[str]:
+        """Return the nodes that publish on a topic and have no business there."""
+        own = f"/{PUBLISHERS[topic]}"
+        names = Counter(
+            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            for info in self._node.get_publishers_info_by_topic(topic)
+        )
+        if names[own] <= 1 + self.ghosts(PUBLISHERS[topic]):
+            del names[own]
+        # Who has only just come, or is going, is not known by name for a moment.
+        self._nameless[topic] = self._nameless[topic] + 1 if names[_NAMELESS] else 0
+        if self._nameless[topic] <= _PATIENCE:
+            del names[_NAMELESS]
+        return set(names)
+
     def _topics(self) -> list[str]:
-        """Return the topics whose publishers may be others than at the last look."""
+        """Return the topics whose publishers may be others than at the last look, or were not all known."""
         counts = {topic: self._node.count_publishers(topic) for topic in PUBLISHERS}
         every = self._looks % _THOROUGH == 0
-        changed = [topic for topic, count in counts.items() if every or count != self._counts.get(topic)]
+        changed = [t for t, n in counts.items() if every or n != self._counts.get(t) or n > 1 or self._nameless[t]]
         self._looks, self._counts = self._looks + 1, counts
         return changed

@@ -144,5 +144,10 @@ class Episodes(LazyEpisodes):
         """Most boxes that any level of the run has."""
         return self.source.max_boxes
 
+    @property
+    def seeds(self) -> range:
+        """Seeds of the episodes, in their order."""
+        return range(self.seed, self.seed + len(self))
+
     def _make(self, index: int) -> EpisodeSpec:
-        return self.source.episode(self.seed + index)
+        return self.source.episode(self.seeds[index])

@@ -66,7 +66,7 @@ class Play:
         self.graph = InProcess(self.parameters, ())
         self._open = True
         self.tap = self.graph.add(Tap())
-        self.monitor = self.graph.add(MonitorNode(len(episodes)))
+        self.monitor = self.graph.add(MonitorNode(episodes))
         for name in names:
             self.graph.start(name)
 

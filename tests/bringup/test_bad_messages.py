@@ -1,5 +1,7 @@
 """Whatever anybody publishes on the graph's topics, the episode goes on, and the stranger is named."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import rclpy
@@ -8,10 +10,12 @@ from std_msgs.msg import String
 
 from benchmarks.malformed import TARGETS, Vandal
 from bringup.graph_recorder import RecorderNode
+from bringup.monitor import ANOTHER_RUN
 from bringup.viz import VizNode
 from mujoban_msgs_py import conversions, listening, topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import generate_level
 
 
 @pytest.mark.parametrize("realtime", [0.0, 8.0])
@@ -54,6 +58,46 @@ def test_a_stranger_on_a_topic_of_the_graph_is_named_also_with_a_foreign_type(pl
     graph.spin_until(lambda: graph.monitor.watch.seen == expected)
     assert graph.monitor.counts["foreign publishers"] >= 1
     assert graph.finish()[0].solved
+
+
+def test_a_second_node_of_a_name_is_named_but_not_those_of_processes_that_were_killed(play_graph, stranger, capfd):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1), names=["simulator"])
+    watch = graph.monitor.watch
+    second = rclpy.create_node("simulator", context=stranger.context)
+    second.create_publisher(topics.POSE.type, topics.POSE.name, topics.POSE.qos)
+    watch.ghosts = lambda name: name == "simulator"
+    graph.spin_until(lambda: graph.monitor.count_publishers(topics.POSE.name) == 2)
+    watch.look()
+    assert not watch.seen
+    watch.ghosts = lambda name: 0
+    graph.spin_until(lambda: watch.seen == {(topics.POSE.name, "/simulator")})
+    assert "a second node /simulator publishes on /pose (of /simulator)" in capfd.readouterr().err
+
+
+def test_who_has_no_name_yet_is_given_time_to_say_it(play_graph, monkeypatch):
+    graph = play_graph(names=[])
+    nobody = SimpleNamespace(node_namespace="_NODE_NAMESPACE_UNKNOWN_", node_name="_NODE_NAME_UNKNOWN_")
+    monkeypatch.setattr(graph.monitor, "get_publishers_info_by_topic", lambda topic: [nobody])
+    graph.monitor.watch.look()
+    assert not graph.monitor.watch.seen
+    graph.spin_until(lambda: graph.monitor.watch.seen)
+    assert graph.monitor.counts["foreign publishers"] == 1
+
+
+@pytest.mark.parametrize(("seed", "difficulty"), [(77, 1), (0, 2)])
+def test_an_episode_of_another_run_is_no_result_of_this_one(play_graph, seed, difficulty, capfd):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1), names=[])
+    topic = topics.TRUE_EPISODE
+    mouth = graph.tap.create_publisher(topic.type, topic.name, topic.qos)
+    graph.spin_until(lambda: mouth.get_subscription_count() == 2)
+    reading = conversions.EpisodeTruthReading(
+        episode=1, seed=seed, difficulty=difficulty, level=generate_level(1, 0).to_text(), step=9, reward=0.0,
+        episode_return=1.0, solved=True, terminated=True, truncated=False, boxes_on_target=1,
+    )  # fmt: skip
+    mouth.publish(conversions.episode_truth_to_msg(conversions.header(topics.TICK), reading))
+    graph.spin_until(lambda: graph.monitor.counts[ANOTHER_RUN] == 1)
+    assert graph.monitor.episode is None and not graph.monitor.results
+    assert f"it plays seed {seed} at difficulty {difficulty}" in capfd.readouterr().err
 
 
 def test_an_end_that_the_simulator_did_not_announce_is_taken_back_when_the_tick_is_offered_again(play_graph):

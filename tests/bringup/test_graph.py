@@ -122,7 +122,7 @@ def test_processes_that_are_killed_are_started_again(ros, oracles):
     episodes = Episodes(1, 0, difficulty=2)
     parameters = graph_parameters(oracles, episodes)
     with InProcess(parameters, ()) as graph, Processes(parameters) as processes:
-        monitor = graph.add(MonitorNode(1))
+        monitor = graph.add(MonitorNode(episodes))
         monitor.create_timer(0.1, processes.supervise)
 
         def spin_until(condition):
