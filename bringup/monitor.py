@@ -15,6 +15,7 @@ from rclpy.task import Future
 
 from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
+from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import LOG_PERIOD, PublisherWatch, Received, listen
@@ -153,11 +154,10 @@ class MonitorNode(Node):
         end, self._end = self._end, None
         assert end is not None
         self._ended = time.perf_counter()
-        assert self.latest is not None
+        # In real time, or of a stranger, an end may be heard before any tick.
+        last = np.zeros((GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32) if self.latest is None else self.latest.truth
         self.results.append(
-            self._log.result(
-                solved=end.solved, steps=end.step, episode_return=end.episode_return, last=self.latest.truth
-            )
+            self._log.result(solved=end.solved, steps=end.step, episode_return=end.episode_return, last=last)
         )
         if len(self.results) == len(self._episodes):
             self.finished.set_result(None)

@@ -84,17 +84,35 @@ def test_who_has_no_name_yet_is_given_time_to_say_it(play_graph, monkeypatch):
     assert graph.monitor.counts["foreign publishers"] == 1
 
 
-@pytest.mark.parametrize(("seed", "difficulty"), [(77, 1), (0, 2)])
-def test_an_episode_of_another_run_is_no_result_of_this_one(play_graph, seed, difficulty, capfd):
-    graph = play_graph(episodes=Episodes(1, 0, difficulty=1), names=[])
-    topic = topics.TRUE_EPISODE
+@pytest.fixture
+def say_end(play_graph):
+    """Return a graph without nodes that awaits seeds 0 and 1, and a function that says how one ends."""
+    graph, topic = play_graph(episodes=Episodes(2, 0, difficulty=1), names=[]), topics.TRUE_EPISODE
     mouth = graph.tap.create_publisher(topic.type, topic.name, topic.qos)
     graph.spin_until(lambda: mouth.get_subscription_count() == 2)
-    reading = conversions.EpisodeTruthReading(
-        episode=1, seed=seed, difficulty=difficulty, level=generate_level(1, 0).to_text(), step=9, reward=0.0,
-        episode_return=1.0, solved=True, terminated=True, truncated=False, boxes_on_target=1,
-    )  # fmt: skip
-    mouth.publish(conversions.episode_truth_to_msg(conversions.header(topics.TICK), reading))
+
+    def say(seed, difficulty=1):
+        reading = conversions.EpisodeTruthReading(
+            episode=seed + 1, seed=seed, difficulty=difficulty, level=generate_level(1, 0).to_text(), step=9, reward=0,
+            episode_return=0.0, solved=False, terminated=False, truncated=True, boxes_on_target=1,
+        )  # fmt: skip
+        mouth.publish(conversions.episode_truth_to_msg(conversions.header((seed + 1) * topics.TICK), reading))
+
+    return graph, say
+
+
+def test_an_end_that_is_heard_before_any_tick_ends_its_episode_alone(say_end):
+    graph, say = say_end
+    say(0)
+    say(1)
+    graph.spin_until(lambda: graph.monitor.results)
+    assert graph.monitor.results[0].steps == 9 and not graph.monitor.results[0].solved
+
+
+@pytest.mark.parametrize(("seed", "difficulty"), [(77, 1), (0, 2)])
+def test_an_episode_of_another_run_is_no_result_of_this_one(say_end, seed, difficulty, capfd):
+    graph, say = say_end
+    say(seed, difficulty)
     graph.spin_until(lambda: graph.monitor.counts[ANOTHER_RUN] == 1)
     assert graph.monitor.episode is None and not graph.monitor.results
     assert f"it plays seed {seed} at difficulty {difficulty}" in capfd.readouterr().err
