@@ -55,6 +55,8 @@ _RECORDED_STEPS: Final = 900
 """Longest recorded episode."""
 _EVALUATED_STEPS: Final = 500_000
 """Environment steps of the controller's training between two evaluations, which no budget counts."""
+_JUDGED_PER_HOUR: Final = 16
+"""Validation levels of each such evaluation, per hour of the whole run; at most 64."""
 _SENSES: Final = ("--streams", "5", "--learner.slip", "0.015", "--learner.lost", "0.05")
 """Batch of estimator and termination, and how far the odometer is off in training."""
 _VIEWS: Final = ("--noise", "0.1", "--hidden", "0.3")
@@ -106,7 +108,8 @@ def _controller(options: Options) -> list[Stage]:
     run = options.run
     common = ("--seed", str(options.seed), "--task.world", options.world)
     teacher, student = "teacher/teacher.safetensors", "controller_distil/controller.safetensors"
-    common += ("--steps", str(_STEPS), "--evaluate-every", str(_EVALUATED_STEPS))
+    judged = max(4, min(64, round(_JUDGED_PER_HOUR * options.hours)))
+    common += ("--steps", str(_STEPS), "--evaluate-every", str(_EVALUATED_STEPS), "--evaluation-episodes", str(judged))
     train = "mujoban_controller.train"
     return [
         _trainer(options, "teacher", (train, "--stage", "teacher", *common), teacher),
