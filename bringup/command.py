@@ -14,12 +14,24 @@ from typing import TYPE_CHECKING
 
 from mujoban_core.bodies import BALL
 from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
-from mujoban_core.plugins import AGENT, LEARNED, ORACLE, PRIVILEGED, ROLES, load_module, shipped_weights
+from mujoban_core.plugins import (
+    AGENT,
+    LEARNED,
+    ORACLE,
+    PRIVILEGED,
+    ROLES,
+    SCOUT,
+    SCRIPTED,
+    load_module,
+    load_scout,
+    shipped_weights,
+)
 
 if TYPE_CHECKING:
     from mujoban_core.agent import AgentPolicy
     from mujoban_core.interfaces import Module
     from mujoban_core.sense_plan_act import SensePlanAct
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -54,7 +66,7 @@ class Choice:
         """
         from mujoban_rl.weights import WeightsError, digest
 
-        if self.source == ORACLE:
+        if self.source in (ORACLE, SCRIPTED) or (self.role == SCOUT and self.source != LEARNED):
             return self.source
         if self.source != LEARNED:
             return f"{self.source}{PRIVILEGED}" if self.load().privileged else self.source
@@ -79,6 +91,8 @@ class Stack:
 
     body: str = BALL.name
     """The robot's body; learned modules have to be of it."""
+    scout: Choice = Choice(SCOUT, SCRIPTED)
+    """What says where to look before pushing."""
 
     @property
     def look_around_ticks(self) -> int:
@@ -104,11 +118,14 @@ class Stack:
 
             modules["planner"] = look_ahead(modules["planner"], self.look_ahead)
         ticks = self.look_around_ticks
-        return SensePlanAct(**{role: look_around(module, ticks) for role, module in modules.items()})  # pyright: ignore
+        scout = load_scout(self.scout.source, self.scout.weights, self.device) if ticks else None
+        looking = {role: look_around(module, ticks, scout) for role, module in modules.items()}
+        return SensePlanAct(**looking)  # pyright: ignore
 
     def identities(self) -> dict[str, str]:
-        """Return what identifies each module in a report."""
-        return {role: choice.identity() for role, choice in self.choices.items()}
+        """Return what identifies each module in a report, and what says where to look, if anything does."""
+        scout = {SCOUT: self.scout.identity()} if self.look_around_ticks else {}
+        return {role: choice.identity() for role, choice in self.choices.items()} | scout
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from bringup.command import Choice, Player, Solo, Stack, oracle
 from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_core.plugins import AGENT, LEARNED, ROLES
+from mujoban_core.plugins import AGENT, LEARNED, ROLES, SCOUT, SCRIPTED
 from mujoban_core.program import say
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 
@@ -105,6 +105,8 @@ class ModuleOptions:
     look_around: Annotated[int | None, whole("TICKS", 0)] = None
     """Look around before the first decision, and walk to where more can be seen: the length of each turn on the spot,
     0 for none; by default that of docs/estimator.md, 0 for the oracle estimator."""
+    scout: ModuleSource = SCRIPTED
+    """What says where to look: scripted, learned, weights of a learned one, or a class of your own."""
 
     look_ahead: Annotated[int, whole("N", 0)] = 0
     """Let the learned planner search ahead by N evaluations of its network as the robot moves; 0 for none."""
@@ -120,7 +122,8 @@ class ModuleOptions:
             if role not in ROLES:
                 raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
             choices[role] = oracle(role, body)
-        return Stack(choices, self.device, self.look_around, self.look_ahead, self.threads, body)
+        scout = Choice.parse(SCOUT, self.scout)
+        return Stack(choices, self.device, self.look_around, self.look_ahead, self.threads, body, scout)
 
 
 @dataclass(frozen=True)

@@ -65,5 +65,9 @@ def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Para
         }
     for role in LOOKING_ROLES:
         parameters[role]["look_around"] = stack.look_around_ticks
-    parameters["planner"]["look_ahead"] = stack.look_ahead
+    parameters["planner"] |= {
+        "look_ahead": stack.look_ahead,
+        "scout": stack.scout.source,
+        "scout_weights": "" if stack.scout.weights is None else str(stack.scout.weights),
+    }
     return parameters

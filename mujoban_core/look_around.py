@@ -10,6 +10,7 @@ Shapes: B robots, M of them with a decision to take, V viewpoints, N = `grid.GRI
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from typing import Final, TypeVar
 
 import numpy as np
@@ -41,11 +42,11 @@ _UNCERTAIN: Final = (0.05, 0.95)
 """A cell is unknown where the probability of a wall lies between these and no look has shown it."""
 _OPAQUE: Final = 0.9
 """Probability of a wall from which on it hides what lies behind; guesses about unseen cells stay below."""
-_FREE: Final = 0.3
+FREE: Final = 0.3
 """Probability of a wall or a box up to which the robot dares to walk into a cell."""
 _WALK_COST: Final = 0.5
 """Cells of gain that one step of the way is worth."""
-_HEADINGS: Final = 0.4 * math.pi * np.arange(5)
+TURN_HEADINGS: Final = 0.4 * math.pi * np.arange(5)
 """Views that together make a turn, given the camera's 80 degrees."""
 _TURN: Final = 0.7
 """Torque of the turn."""
@@ -56,6 +57,27 @@ _CELLS: Final = GRID_SIZE * GRID_SIZE
 AnyModule = TypeVar("AnyModule", bound=Module)
 
 
+class Scout(ABC):
+    """Says where to look before pushing."""
+
+    @abstractmethod
+    def step(self, abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> Instruction | None:
+        """Return the next step to where more can be seen; STAY to turn here, None if nothing more is to be seen.
+
+        Args:
+            abstract_state: Estimate, [N, N, 4].
+            shown: Cells that turns have shown, [N, N]: what they have not made certain will not become so by looking.
+        """
+
+
+class ScriptedScout(Scout):
+    """Walks to where a turn shows most that is unknown, by a rule."""
+
+    def step(self, abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> Instruction | None:
+        """Return the first step of the way there, STAY if it is here, None if no place is worth the way."""
+        return step_to_view(abstract_state, shown)
+
+
 class LookAroundPlanner(Planner):
     """Looks around first, and wherever there is something to be seen; else says what another planner says.
 
@@ -63,9 +85,17 @@ class LookAroundPlanner(Planner):
     [B]; the instructions left for looking, int64 [B]; the cells that looks have shown, bool [B, N, N].
     """
 
-    def __init__(self, inner: Planner, ticks: int, walks: int = WALKS) -> None:
-        """Wrap `inner`; a look takes `ticks` ticks, and later looks and the way there `walks` instructions at most."""
+    def __init__(self, inner: Planner, ticks: int, walks: int = WALKS, scout: Scout | None = None) -> None:
+        """Wrap a planner.
+
+        Args:
+            inner: The planner.
+            ticks: Of a look.
+            walks: Instructions that looks after the first and the way there take at most.
+            scout: Says where to look; by default by a rule.
+        """
         self.inner, self.ticks, self.walks = inner, ticks, walks
+        self.scout = scout or ScriptedScout()
         self.privileged = inner.privileged
         self.thinks = inner.thinks
 
@@ -87,7 +117,7 @@ class LookAroundPlanner(Planner):
             if until[i] > 0:  # A look has just ended: what it did not make certain will not become so from here
                 seen[i] |= turn_view(abstract_state[i])
                 until[i] = 0
-            step = None if walks[i] == 0 else step_to_view(abstract_state[i], seen[i])
+            step = None if walks[i] == 0 else self.scout.step(abstract_state[i], seen[i])
             if step is None:
                 ready[i] = True
                 continue
@@ -134,7 +164,9 @@ class LookAroundController(Controller):
         return np.where((inputs.instruction == int(Instruction.STAY))[:, None], turn, torque), memory
 
 
-def look_around(module: AnyModule, ticks: int) -> AnyModule | LookAroundPlanner | LookAroundController:
+def look_around(
+    module: AnyModule, ticks: int, scout: Scout | None = None
+) -> AnyModule | LookAroundPlanner | LookAroundController:
     """Return a planner or controller that looks around, `ticks` a look; 0, or another module: itself.
 
     Raises:
@@ -143,7 +175,7 @@ def look_around(module: AnyModule, ticks: int) -> AnyModule | LookAroundPlanner 
     if ticks < 0:
         raise ValueError(f"look_around {ticks}: expected a number of ticks, 0 for none")
     if ticks and isinstance(module, Planner):
-        return LookAroundPlanner(module, ticks)
+        return LookAroundPlanner(module, ticks, scout=scout)
     if ticks and isinstance(module, Controller):
         return LookAroundController(module)
     return module
@@ -179,15 +211,15 @@ def _views(wall: NDArray[np.float32], cells: NDArray[np.int64]) -> NDArray[np.bo
     """Return which cells a turn in each of `cells`, [V], shows, [V, N * N]."""
     half = (GRID_SIZE - 1) / 2
     x, y = cells % GRID_SIZE - half, half - cells // GRID_SIZE
-    turns = len(_HEADINGS)
-    pose = np.stack([np.repeat(x, turns), np.repeat(y, turns), np.tile(_HEADINGS, len(cells))], -1)
+    turns = len(TURN_HEADINGS)
+    pose = np.stack([np.repeat(x, turns), np.repeat(y, turns), np.tile(TURN_HEADINGS, len(cells))], -1)
     opaque = np.broadcast_to(wall > _OPAQUE, (len(pose), GRID_SIZE, GRID_SIZE))
     return np.any(cells_in_view(opaque, pose, BALL.camera).reshape(len(cells), turns, _CELLS), axis=1)
 
 
 def _walks(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the walking distance to each cell, [N * N], -1 where none leads, and the first step of the way."""
-    free = (abstract_state[..., WALL] < _FREE) & (abstract_state[..., BOX] < _FREE)
+    free = (abstract_state[..., WALL] < FREE) & (abstract_state[..., BOX] < FREE)
     # A level ends in walls whatever an estimate says, and nobody walks off the grid.
     free[[0, -1]] = free[:, [0, -1]] = False
     distance, first = np.full(_CELLS, -1), np.full(_CELLS, int(Instruction.STAY))

@@ -12,10 +12,11 @@ import importlib
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from mujoban_core.agent import Agent
 from mujoban_core.interfaces import Controller, Estimator, Module, Planner, Termination
+from mujoban_core.look_around import Scout
 
 LEARNED: Final = "learned"
 ORACLE: Final = "oracle"
@@ -37,7 +38,13 @@ ROLES: Final[dict[str, type[Module]]] = {
 AGENT: Final = "agent"
 """The role of what plays alone, in the place of all four."""
 
+SCOUT: Final = "scout"
+"""The role of what says where to look before pushing; a part of the planner's wrapper, not a module."""
+SCRIPTED: Final = "scripted"
+"""The scout that goes by a rule."""
+
 _SHIPPED: Final = "weights"
+Made = TypeVar("Made")
 
 
 class PluginError(ValueError):
@@ -58,7 +65,25 @@ def load_module(role: str, source: str = LEARNED, weights: Path | None = None, d
         PluginError: If the role or the class is unknown, or an instance is not of the role's interface.
         ValueError: If weights are missing or damaged.
     """
-    interface = _interface(role)
+    return _make(role, _interface(role), source, weights, device)
+
+
+def load_scout(source: str, weights: Path | None = None, device: str = "cpu") -> Scout:
+    """Return what says where to look before pushing.
+
+    Args:
+        source: "scripted", "learned", the name of another entry point `scout.NAME`, or `package.module:Class`.
+        weights: Weights of the learned one instead of those that ship.
+        device: Device of the learned one.
+
+    Raises:
+        PluginError: If it is unknown, or no `Scout`.
+        ValueError: If weights are missing or damaged.
+    """
+    return _make(SCOUT, Scout, source, weights, device)
+
+
+def _make(role: str, interface: type[Made], source: str, weights: Path | None, device: str) -> Made:
     make = _resolve(source) if ":" in source else _load(role, source)
     module = make() if ":" in source or isinstance(make, type) else make(weights, device)
     if not isinstance(module, interface):
@@ -74,7 +99,8 @@ def is_privileged(identity: str) -> bool:
 
 def shipped_weights(role: str) -> Path:
     """Return where the weights of the learned module for a role are."""
-    _interface(role)
+    if role != SCOUT:
+        _interface(role)
     return Path(_load(role, _SHIPPED))
 
 

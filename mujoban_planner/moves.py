@@ -17,6 +17,7 @@ from torch.nn import functional
 from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_planner.abstract_env import AbstractEnvironment, AbstractStep
 from mujoban_planner.boards import abstract_states
+from mujoban_planner.discrete_mpo import MPOSettings
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.validation import Shares, difficulty_shares
 from mujoban_rl.actors import Actor, Experience
@@ -31,20 +32,13 @@ _SEEDS_PER_STREAM: Final = 10**12
 
 
 @dataclass(frozen=True)
-class PlayConfig:
-    """What defines how an actor plays."""
+class PlayConfig(MPOSettings):
+    """What defines how an actor plays, and how is learned from it."""
 
-    environments: int = 256
-    """Levels that an actor plays at once."""
-    play: int = 10
-    """Instructions in each level between two deliveries of an actor."""
-    n_step: int = 5
-    """Instructions of a return; as many are delivered once more with the next sequence."""
     failure_rate: float = 0.0
     """Probability that an instruction fails, as with a real controller."""
     mix: Shares = (0.1, 0.1, 0.15, 0.2, 0.45)
     """Share of each difficulty among the training levels."""
-    seed: int = 0
 
 
 class LevelStream:

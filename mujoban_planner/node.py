@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mujoban_msgs.msg import Episode
 
 from mujoban_core.interfaces import GroundTruth
+from mujoban_core.look_around import Scout
+from mujoban_core.plugins import SCRIPTED, load_scout
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import described
@@ -23,6 +26,8 @@ class PlannerNode(ModuleNode):
     Parameters, beside those of `ModuleNode`:
         look_ahead: Network evaluations of a tree search that looks for a way to the end of the level, spread over the
             ticks; 0 for none. Fixed when the node starts.
+        scout: What says where to look before pushing: scripted, learned or package.module:Class. Fixed likewise.
+        scout_weights: Weights file of the learned one; empty means those that ship. Fixed likewise.
     """
 
     role = "planner"
@@ -37,6 +42,7 @@ class PlannerNode(ModuleNode):
     def __init__(self, **options: Any) -> None:
         """Load the module and start listening."""
         self._look_ahead: int | None = None
+        self._scout: Scout | None = None
         super().__init__(**options)
 
     def prepare(self, module: Any) -> Any:
@@ -46,6 +52,17 @@ class PlannerNode(ModuleNode):
             value: Any = self.declare_parameter("look_ahead", 0, about).value
             self._look_ahead = value
         return look_ahead(module, self._look_ahead or 0)
+
+    @property
+    def scout(self) -> Scout:
+        """What says where to look."""
+        if self._scout is None:
+            which = described("scripted, learned or package.module:Class", fixed=True)
+            source: Any = self.declare_parameter("scout", SCRIPTED, which).value
+            file = described("weights file of the learned scout; empty: those that ship", fixed=True)
+            weights: Any = self.declare_parameter("scout_weights", "", file).value
+            self._scout = load_scout(source, Path(weights) if weights else None)
+        return self._scout
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
         """Start the state; a planner that joins an episode goes on with the numbers of its predecessor."""

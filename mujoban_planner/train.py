@@ -14,6 +14,7 @@ import tyro
 from mujoban_core.program import read_options, run_command
 from mujoban_planner import load
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
+from mujoban_planner.exploration_mpo import ExplorerConfig, explore
 from mujoban_planner.imitation import ImitationConfig, imitation
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
@@ -145,6 +146,19 @@ class MPOPushes(_ActorCommand):
         push_mpo(self.config, self.run, self.cadence(), self.actors).run(limit_seconds=self.seconds)
 
 
+@dataclass(frozen=True)
+class ExplorerRun(_ActorCommand):
+    """Learn by MPO where to look before pushing."""
+
+    run: Path = Path("runs/explorer")
+    """Run directory; an existing one is resumed."""
+    config: tyro.conf.OmitArgPrefixes[ExplorerConfig] = field(default_factory=ExplorerConfig)
+
+    def main(self) -> None:
+        """Train."""
+        explore(self.config, self.run, self.cadence(), self.actors).run(limit_seconds=self.seconds)
+
+
 def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
     """Run the command line."""
     commands: dict[str, type[_Command]] = {
@@ -153,6 +167,7 @@ def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
         "ppo": PPO,
         "mpo": MPO,
         "mpo-pushes": MPOPushes,
+        "explorer": ExplorerRun,
     }
     command = read_options(commands, command_line, prog, __doc__)
     torch.set_num_threads(command.threads)

@@ -33,7 +33,7 @@ _OFFSET, _SCATTER = 1.5, 1.4
 _DOUBT = 12
 """A cell that was seen differs from the truth by half of the power of a uniform number: 5 % by more than 0.27."""
 
-_BORDER = np.pad(np.zeros((GRID_SIZE - 2, GRID_SIZE - 2), np.bool_), 1, constant_values=True)
+BORDER = np.pad(np.zeros((GRID_SIZE - 2, GRID_SIZE - 2), np.bool_), 1, constant_values=True)
 
 
 def blur(state: Tensor, share: float, generator: torch.Generator) -> Tensor:
@@ -84,22 +84,36 @@ def hide_unseen(state: Tensor, share: float, rng: np.random.Generator) -> Tensor
         return state
     part = state[len(state) - n :].cpu().numpy()
     complete = np.arange(n) < n * _COMPLETE
-    seen = np.concatenate([_visible(part[complete] > 0.5), _seen(part[~complete] > 0.5, rng)])
+    seen = np.concatenate([visible(part[complete] > 0.5), _seen(part[~complete] > 0.5, rng)])
     estimate = np.abs(part - 0.5 * rng.random(part.shape) ** _DOUBT)
-    for layer, (present, absent) in _UNSEEN.items():
-        likely = np.where(complete, _ROCK, present) if layer == WALL else np.full(n, present)
-        logit = np.where(part[..., layer] > 0.5, likely[:, None, None], absent)
-        logit += rng.normal(0.0, _OFFSET, (n, 1, 1)) + rng.normal(0.0, _SCATTER, logit.shape)
-        estimate[..., layer] = np.where(seen, estimate[..., layer], 1.0 / (1.0 + np.exp(-logit)))
+    guess = guesses(part > 0.5, complete, rng)
+    estimate = np.where(seen[..., None], estimate, guess)
     estimate[..., AGENT] = part[..., AGENT]
     return torch.cat([state[: len(state) - n], torch.from_numpy(estimate.astype(np.float32)).to(state.device)])
 
 
-def _visible(state: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def guesses(state: NDArray[np.bool_], complete: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return what the estimator says of cells that it has never seen, [B, N, N, 4]; zeros in the agent's layer.
+
+    Args:
+        state: Abstract states, [B, N, N, 4].
+        complete: Whether all that can be seen was seen, so that what is left must be rock, [B].
+        rng: Source of the guesses.
+    """
+    n, guess = len(state), np.zeros(state.shape)
+    for layer, (present, absent) in _UNSEEN.items():
+        likely = np.where(complete, _ROCK, present) if layer == WALL else np.full(n, present)
+        logit = np.where(state[..., layer], likely[:, None, None], absent)
+        logit += rng.normal(0.0, _OFFSET, (n, 1, 1)) + rng.normal(0.0, _SCATTER, logit.shape)
+        guess[..., layer] = 1.0 / (1.0 + np.exp(-logit))
+    return guess
+
+
+def visible(state: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the cells that can be seen from somewhere, [B, N, N]: the floor and what is next to it, and the border."""
     floor = np.pad(~state[..., WALL], ((0, 0), (1, 1), (1, 1)))
     windows = np.lib.stride_tricks.sliding_window_view(floor, (3, 3), axis=(1, 2))
-    return windows.any((3, 4)) | _BORDER
+    return windows.any((3, 4)) | BORDER
 
 
 def _seen(state: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -119,4 +133,4 @@ def _seen(state: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.bool
     wall = np.repeat(state[..., WALL], _VIEWS, axis=0)
     view = cells_in_view(wall, pose, BALL.camera).reshape(n, _VIEWS, GRID_SIZE, GRID_SIZE)
     count = rng.integers(1, _VIEWS + 1, (n, 1))
-    return np.any(view & (np.arange(_VIEWS) < count)[..., None, None], axis=1) | _BORDER
+    return np.any(view & (np.arange(_VIEWS) < count)[..., None, None], axis=1) | BORDER

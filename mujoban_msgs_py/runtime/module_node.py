@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 
 from mujoban_core.interfaces import GroundTruth, module_seeds
-from mujoban_core.look_around import LOOKING_ROLES, look_around
+from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
 from mujoban_core.plugins import LEARNED, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
@@ -140,7 +140,12 @@ class ModuleNode(TickNode):
 
     def _load(self, weights: str, device: str) -> Any:
         module = load_module(self.role, self._source, Path(weights) if weights else None, device)
-        return look_around(self.prepare(module), self._look_around)
+        return look_around(self.prepare(module), self._look_around, self.scout)
+
+    @property
+    def scout(self) -> Scout | None:
+        """What says where to look, for a planner that looks around."""
+        return None
 
     def prepare(self, module: Any) -> Any:
         """Return the module that was loaded as this node wants it; a ValueError refuses it."""

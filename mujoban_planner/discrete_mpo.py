@@ -1,0 +1,195 @@
+"""Discrete MPO for networks that answer states with a policy and Q-values (paper C.2): settings, replay, learner.
+
+n-step returns off-policy from a replay train the Q head, discrete MPO the policy head.
+
+Shapes: B batch, A actions; states of any shape `...`.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mujoban_planner.teacher import DISCOUNT
+from mujoban_rl.actors import Experience
+from mujoban_rl.engine import Learner, State
+from mujoban_rl.limits import NaNGuard
+from mujoban_rl.losses.mpo import scalars
+from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
+from mujoban_rl.losses.returns import windowed_returns
+from mujoban_rl.optimise import guarded_step
+from mujoban_rl.replay import SequenceReplay
+
+_CLIP: Final = 40.0
+"""Largest norm of the gradient."""
+
+
+@dataclass(frozen=True)
+class MPOSettings:
+    """What defines replay and learning."""
+
+    environments: int = 256
+    """Levels that an actor plays at once."""
+    play: int = 10
+    """Instructions in each level between two deliveries of an actor."""
+    n_step: int = 5
+    """Instructions of a return; as many are delivered once more with the next sequence."""
+    mpo: DiscreteMPOConfig = field(default_factory=DiscreteMPOConfig)
+    steps_per_update: float = 1.0
+    """Instructions in each of `environments` levels per update."""
+    replay_steps: int = 400
+    """Instructions in each of `environments` levels that are kept."""
+    warm_up_steps: int = 40
+    """Instructions in each of `environments` levels before the first update."""
+    batch_size: int = 256
+    discount: float = DISCOUNT
+    learning_rate: float = 1e-4
+    dual_learning_rate: float = 1e-2
+    target_period: int = 100
+    """Updates between copies to the target network."""
+    q_weight: float = 0.5
+    """Weight of the critic's loss."""
+    seed: int = 0
+
+
+class MPOBatch(NamedTuple):
+    """Instructions that were executed, with what came of them."""
+
+    state: Tensor
+    """float32 [B, ...]."""
+    instruction: Tensor
+    """int64 [B]."""
+    reward: Tensor
+    """Discounted reward of up to n instructions, float32 [B]."""
+    bootstrap: Tensor
+    """Discount of the value of `last`, 0 where the episode terminated, float32 [B]."""
+    last: Tensor
+    """States from which the value goes on, float32 [B, ...]."""
+    valid: Tensor
+    """False where the instruction failed, bool [B]."""
+
+    def to(self, device: torch.device) -> MPOBatch:
+        """Return the batch on a device."""
+        return MPOBatch._make(values.to(device, non_blocking=True) for values in self)
+
+
+class StepStore:
+    """Replay of what actors played: `state`, `instruction`, `reward`, `terminated`, `dropped`."""
+
+    def __init__(self, config: MPOSettings) -> None:
+        """Start empty."""
+        self._config = config
+        length = config.play + config.n_step
+        self.replay = SequenceReplay(max(1, config.replay_steps * config.environments // config.play), length)
+        self._generator = torch.Generator().manual_seed(config.seed)
+
+    def add(self, experience: Experience) -> None:
+        """Take in a sequence of each of an actor's levels."""
+        self.replay.add(experience.arrays)
+
+    def sample(self) -> MPOBatch:
+        """Return a batch with n-step returns."""
+        return self._played(self._config.batch_size)
+
+    def _played(self, count: int) -> MPOBatch:
+        window = self.replay.sample(count, self._generator, self._config.n_step + 1)
+        reward, terminated, dropped = (window[name][:, :-1] for name in ("reward", "terminated", "dropped"))
+        returns = windowed_returns(reward, terminated, dropped, self._config.discount)
+        last = window["state"][torch.arange(count), returns.index]
+        state, instruction = window["state"][:, 0].float(), window["instruction"][:, 0]
+        return MPOBatch(state, instruction, returns.reward, returns.bootstrap, last.float(), returns.valid)
+
+    def state(self) -> State:
+        """Return the replay and what draws from it."""
+        own = State(tensors={"generator": self._generator.get_state()})
+        return State.of({"own": own, "replay": self.replay.state()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._generator.set_state(state.part("own").tensors["generator"])
+        self.replay.restore(state.part("replay"))
+
+
+class Answer(Protocol):
+    """What a network says about states."""
+
+    @property
+    def policy(self) -> Tensor:
+        """Logits, [B, A]."""
+        ...
+
+    @property
+    def q(self) -> Tensor:
+        """[B, A]."""
+        ...
+
+
+class DiscreteMPOLearner(Learner[MPOBatch]):
+    """Online and target network, and the dual variables."""
+
+    network: nn.Module
+    """Answers states, float32 [B, ...], with an `Answer`."""
+    target: nn.Module
+
+    def __init__(self, config: MPOSettings, network: nn.Module, device: torch.device | str = "cpu") -> None:
+        """Train `network` in place."""
+        self.config, self.device = config, torch.device(device)
+        self.network = network.to(self.device).train()
+        self.target = copy.deepcopy(self.network).eval()
+        self.mpo = DiscreteMPO(config.mpo).to(self.device)
+        self._adam = torch.optim.Adam(self.network.parameters(), config.learning_rate)
+        self._dual_adam = self.mpo.duals.adam(config.dual_learning_rate)
+        self._updates = 0
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """Both networks and the dual variables."""
+        return {"network": self.network, "target": self.target, "mpo": self.mpo}
+
+    @property
+    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """Those of the network and of the dual variables."""
+        return {"adam": self._adam, "duals": self._dual_adam}
+
+    def state(self) -> State:
+        """Return the number of updates, by which the target network follows."""
+        return State({"updates": self._updates})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._updates = state.values["updates"]
+
+    def update(self, batch: MPOBatch, progress: float, guard: NaNGuard) -> dict[str, float]:
+        """Take one gradient step of policy, critic and dual variables."""
+        config, batch = self.config, batch.to(self.device)
+        with torch.no_grad(), self._autocast():
+            before, after = self._answers(self.target, batch.state), self._answers(self.target, batch.last)
+        target = batch.reward + batch.bootstrap * expected_value(after.q, after.policy)
+        with self._autocast():
+            output = self._answers(self.network, batch.state)
+        policy_loss, stats = self.mpo(output.policy, before.policy, before.q)
+        taken = output.q.gather(1, batch.instruction[:, None])[:, 0]
+        errors = functional.smooth_l1_loss(taken, target, reduction="none")
+        q_loss = (errors * batch.valid).sum() / batch.valid.sum().clamp(min=1)
+        guarded_step(policy_loss + config.q_weight * q_loss, [self._adam, self._dual_adam], guard, clip=_CLIP)
+        self._updates += 1
+        if self._updates % config.target_period == 0:
+            self.target.load_state_dict(self.network.state_dict())
+        return {"q_loss": q_loss.item(), "mean_reward": batch.reward.mean().item()} | scalars(stats._asdict())
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16)
+
+    def weights(self) -> Mapping[str, Tensor]:
+        """Return the online network, which actors play with."""
+        return self.network.state_dict()
+
+    @staticmethod
+    def _answers(network: nn.Module, states: Tensor) -> Answer:
+        return network(states)

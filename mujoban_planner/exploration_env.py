@@ -1,0 +1,149 @@
+"""Going and looking, in hundreds of levels at once: a grid model of what a camera behind full walls gets to see.
+
+A robot walks from cell to cell, sees what lies ahead of it, and turns on the spot where it stays; it pushes nothing.
+What it perceives of cells that it has not seen is what the estimator guesses there (`mujoban_planner.uncertainty`).
+
+Shapes: E levels, M of their rows, N = `grid.GRID_SIZE`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mujoban_core.bodies import BALL
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
+from mujoban_core.look_around import TURN_HEADINGS, WALKS
+from mujoban_core.visibility import cells_in_view
+from mujoban_planner.uncertainty import BORDER, guesses, visible
+from mujoban_rl.engine import State
+
+DONE: Final = len(Instruction)
+"""The action behind the instructions: there is nothing more to look for."""
+ACTIONS: Final = DONE + 1
+SHOWN: Final = 4
+"""Channel of the cells that looks have shown, behind those of the abstract state."""
+CHANNELS: Final = SHOWN + 1
+_HEADINGS: Final = np.arctan2(-OFFSETS_RC[:, 0].astype(float), OFFSETS_RC[:, 1].astype(float))
+"""Direction of travel of each instruction in radians; that of STAY is not used."""
+_CHANGING: Final = ("level", "agent", "seen", "shown", "guess", "steps")
+
+
+@dataclass(frozen=True)
+class ExplorationReward:
+    """What looking is worth; in the unit of the planner's rewards."""
+
+    cell: float = 0.1
+    """Of each cell that comes into view for the first time."""
+    move: float = 0.05
+    """Cost of a step."""
+    look: float = 0.15
+    """Cost of a turn on the spot."""
+
+
+class ExplorationStep(NamedTuple):
+    """Outcome of an action, [E] each."""
+
+    reward: NDArray[np.float32]
+    done: NDArray[np.bool_]
+    """Whether the robot has ended the exploration."""
+    truncated: NDArray[np.bool_]
+    """Whether its instructions were used up."""
+
+
+class ExplorationEnvironment:
+    """E levels that are explored.
+
+    Observation: estimate and cells that looks have shown, float32 [E, N, N, 5]. Action: STAY (a turn on the spot), a
+    step north, east, south or west, or `DONE`. Reward: see `ExplorationReward`. Every episode begins with a turn.
+    """
+
+    def __init__(
+        self, levels: NDArray[np.float32], rng: np.random.Generator, reward: ExplorationReward | None = None
+    ) -> None:
+        """Begin an episode in each level.
+
+        Args:
+            levels: Abstract states, [E, N, N, 4].
+            rng: Source of the estimator's guesses.
+            reward: Weights of the reward.
+        """
+        self._rng, self._reward = rng, reward or ExplorationReward()
+        batch = len(levels)
+        self.level = np.zeros(levels.shape, np.bool_)
+        """Abstract states as they are; the robot's layer is that of the start."""
+        self.agent = np.zeros((batch, 2), np.int64)
+        """(row, column)."""
+        self.seen = np.zeros((batch, GRID_SIZE, GRID_SIZE), np.bool_)
+        self.shown = np.zeros_like(self.seen)
+        """Cells that turns on the spot have shown."""
+        self.guess = np.zeros(self.level.shape, np.float32)
+        self.steps = np.zeros(batch, np.int64)
+        self.begin(np.arange(batch), levels)
+
+    def begin(self, rows: NDArray[np.int64], levels: NDArray[np.float32]) -> None:
+        """Begin episodes in other levels, [M, N, N, 4], in the given rows, [M]."""
+        self.level[rows] = levels > 0.5
+        self.guess[rows] = guesses(self.level[rows], np.zeros(len(rows), np.bool_), self._rng)
+        self.agent[rows] = np.argwhere(self.level[rows][..., AGENT])[:, 1:]
+        self.seen[rows], self.shown[rows], self.steps[rows] = BORDER, BORDER, 0
+        self._look(rows)
+
+    def _look(self, rows: NDArray[np.int64]) -> None:
+        turned = np.repeat(rows, len(TURN_HEADINGS))
+        view = self._view(turned, np.tile(TURN_HEADINGS, len(rows)))
+        view = view.reshape(len(rows), len(TURN_HEADINGS), GRID_SIZE, GRID_SIZE).any(1)
+        self.seen[rows] |= view
+        self.shown[rows] |= view
+
+    def _view(self, rows: NDArray[np.int64], heading: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return which cells a robot sees in its cell with a heading, [M, N, N]."""
+        half = (GRID_SIZE - 1) / 2
+        pose = np.stack([self.agent[rows, 1] - half, half - self.agent[rows, 0], heading], -1)
+        return cells_in_view(self.level[rows][..., WALL], pose, BALL.camera)
+
+    @property
+    def remaining(self) -> NDArray[np.int64]:
+        """Cells that can be seen from somewhere and have not been, [E]."""
+        return (visible(self.level) & ~self.seen).sum((1, 2))
+
+    def observe(self) -> NDArray[np.float32]:
+        """Return estimates with the cells that looks have shown, [E, N, N, 5]."""
+        state = np.where(self.seen[..., None], self.level, self.guess)
+        state[..., AGENT] = 0.0
+        state[np.arange(len(state)), self.agent[:, 0], self.agent[:, 1], AGENT] = 1.0
+        return np.concatenate([state, self.shown[..., None]], -1).astype(np.float32)
+
+    def step(self, action: NDArray[np.int64]) -> ExplorationStep:
+        """Execute an action in every level, [E]."""
+        before, config = self.seen.sum((1, 2)), self._reward
+        moves = (action > 0) & (action < DONE)
+        ahead = self.agent + OFFSETS_RC[np.where(moves, action, 0)]
+        row, column = ahead.T
+        every = np.arange(len(action))
+        blocked = self.level[every, row, column, WALL] | self.level[every, row, column, BOX]
+        self.agent = np.where((moves & ~blocked)[:, None], ahead, self.agent)
+        walked, looked = np.flatnonzero(moves), np.flatnonzero(action == Instruction.STAY)
+        self.seen[walked] |= self._view(walked, _HEADINGS[action[walked]])
+        self._look(looked)
+        self.steps += 1
+        cost = np.where(moves, config.move, 0.0) + np.where(action == Instruction.STAY, config.look, 0.0)
+        reward = config.cell * (self.seen.sum((1, 2)) - before) - cost
+        done = action == DONE
+        truncated = ~done & (self.steps >= WALKS)
+        return ExplorationStep(reward.astype(np.float32), done, truncated)
+
+    def state(self) -> State:
+        """Return all that changes, levels included."""
+        tensors = {name: torch.from_numpy(getattr(self, name).copy()) for name in _CHANGING}
+        return State({"rng": self._rng.bit_generator.state}, tensors)
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._rng.bit_generator.state = state.values["rng"]
+        for name in _CHANGING:
+            getattr(self, name)[...] = state.tensors[name].numpy()

@@ -1,0 +1,178 @@
+"""Train the explorer by MPO: `python -m mujoban_planner.train explorer --run DIR`.
+
+Shapes: E levels, A actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from mujoban_core.grid import Instruction
+from mujoban_core.look_around import Scout, ScriptedScout
+from mujoban_planner.boards import abstract_states
+from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch, StepStore
+from mujoban_planner.exploration_env import DONE, SHOWN, ExplorationEnvironment, ExplorationReward
+from mujoban_planner.explorer import Explorer
+from mujoban_planner.moves import LevelStream, PlayConfig
+from mujoban_planner.validation import difficulty_shares, validation_levels
+from mujoban_rl.actors import Actor, ActorOptions, ActorSource, Experience
+from mujoban_rl.engine import Budget, Cadence, State, Trainer
+from mujoban_rl.losses.mpo_discrete import DiscreteMPOConfig
+from mujoban_rl.replay import SequenceBuilder
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.weights import provenance, save_weights
+
+_JUDGED: Final = 128
+"""Validation levels of an evaluation."""
+_STREAM: Final = 3
+"""Tells the random streams of exploration from others of the same seed."""
+
+
+@dataclass(frozen=True)
+class ExplorerConfig(PlayConfig):
+    """What defines a run."""
+
+    channels: int = 32
+    blocks: int = 4
+    reward: ExplorationReward = field(default_factory=ExplorationReward)
+    environments: int = 128
+    mpo: DiscreteMPOConfig = field(
+        default_factory=lambda: DiscreteMPOConfig(epsilon_policy=0.01, initial_temperature=0.3, initial_alpha=1.0)
+    )
+    replay_steps: int = 300
+    discount: float = 0.97
+    learning_rate: float = 1e-3
+    q_weight: float = 5.0
+    cpu_seconds: float = 1200.0
+    """CPU seconds after which the run is complete."""
+    updates: float = 1e9
+    """Updates after which it is complete."""
+
+
+class ExplorerActor(Actor):
+    """Explores by actions that are drawn from the policy."""
+
+    def __init__(self, config: ExplorerConfig, network: Mapping[str, Any], stream: int) -> None:
+        """Begin E levels; `stream` is the number of the random stream."""
+        self._config, self._explorer = config, Explorer(**network).eval()
+        self._levels = LevelStream(difficulty_shares(config.mix), config.seed, stream)
+        rng = np.random.default_rng([config.seed, _STREAM, stream])
+        first = self._levels.draw(config.environments).numpy()
+        self._environment = ExplorationEnvironment(first, rng, config.reward)
+        self._generator = torch.Generator().manual_seed(int(rng.integers(1 << 31)))
+        self._builder = SequenceBuilder(config.play + config.n_step, config.n_step)
+
+    def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
+        """Explore with these weights."""
+        self._explorer.load_state_dict(weights)
+
+    @torch.no_grad()
+    def act(self) -> Experience:
+        """Explore until there is a sequence."""
+        steps, sequence = 0, None
+        rewards: list[float] = []
+        while sequence is None:
+            state = self._environment.observe()
+            with torch.autocast("cpu", torch.bfloat16):
+                policy = self._explorer(torch.from_numpy(state)).policy
+            chances = functional.softmax(policy.float(), 1)
+            action = torch.multinomial(chances, 1, generator=self._generator)[:, 0].numpy()
+            step = self._environment.step(action)
+            over = np.flatnonzero(step.done | step.truncated)
+            self._environment.begin(over, self._levels.draw(len(over)).numpy())
+            steps += len(action)
+            rewards += step.reward.tolist()
+            kept = {"state": state.astype(np.float16), "instruction": action, "reward": step.reward}
+            sequence = self._builder.add({**kept, "terminated": step.done, "dropped": step.truncated})
+        return Experience(sequence, steps, {"reward": np.array(rewards)})
+
+    def state(self) -> State:
+        """Return all that changes but the weights."""
+        own = State(tensors={"generator": self._generator.get_state()})
+        parts = {"levels": self._levels, "environment": self._environment, "builder": self._builder}
+        return State.of({"own": own} | {name: part.state() for name, part in parts.items()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._generator.set_state(state.part("own").tensors["generator"])
+        self._levels.restore(state.part("levels"))
+        self._environment.restore(state.part("environment"))
+        self._builder.restore(state.part("builder"))
+
+
+def judge_scout(
+    scout: Scout, reward: ExplorationReward, levels: int = _JUDGED, difficulty: int = 5
+) -> dict[str, float]:
+    """Let a scout explore validation levels; return averages over them.
+
+    `found` is the share of what can be seen and the first turn has not shown; `steps` and `looks` are the instructions
+    of an episode, `reward` their return.
+    """
+    states = abstract_states(validation_levels(difficulty, levels))
+    environment = ExplorationEnvironment(states, np.random.default_rng(0), reward)
+    hidden, going = environment.remaining, np.ones(levels, np.bool_)
+    steps, looks, returns = np.zeros(levels), np.zeros(levels), np.zeros(levels)
+    while going.any():
+        action = np.full(levels, DONE)
+        observed = environment.observe()
+        for i in np.flatnonzero(going):
+            answer = scout.step(observed[i, ..., :SHOWN], observed[i, ..., SHOWN] > 0.5)
+            action[i] = DONE if answer is None else int(answer)
+        step = environment.step(action)
+        looks += action == Instruction.STAY
+        steps += (action != Instruction.STAY) & (action != DONE)
+        returns += step.reward
+        going &= ~(step.done | step.truncated)
+    found = 1.0 - environment.remaining.sum() / max(int(hidden.sum()), 1)
+    means = {"steps": steps.mean(), "looks": looks.mean(), "reward": returns.mean()}
+    return {"found": float(found)} | {name: float(value) for name, value in means.items()}
+
+
+class ExplorerLearner(DiscreteMPOLearner):
+    """Learns where to look."""
+
+    target: Explorer
+
+    def __init__(self, config: ExplorerConfig) -> None:
+        """Build the network."""
+        torch.manual_seed(config.seed)  # the initial weights
+        super().__init__(config, Explorer(config.channels, config.blocks))
+        self._reward = config.reward
+
+    def evaluate(self) -> dict[str, float]:
+        """Return what the target network gets to see of validation levels, and what the scripted scout does."""
+        learned, scripted = judge_scout(self.target, self._reward), judge_scout(ScriptedScout(), self._reward)
+        return learned | {f"scripted/{name}": value for name, value in scripted.items()}
+
+    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
+        """Write the target network with its record."""
+        save_weights(directory.path / "explorer.safetensors", self.target, self.target.config, record)
+
+
+def explore(
+    config: ExplorerConfig, directory: Path, cadence: Cadence | None = None, actors: ActorOptions | None = None
+) -> Trainer[MPOBatch]:
+    """Open or resume a run."""
+    learner = ExplorerLearner(config)
+    pool = (actors or ActorOptions()).pool(partial(ExplorerActor, config, learner.target.config))
+    source = ActorSource(
+        pool, StepStore(config), steps_per_update=config.steps_per_update * config.environments,
+        first_steps=config.warm_up_steps * config.environments,
+    )  # fmt: skip
+    record = {
+        **provenance(),
+        "method": "mpo, reward for cells that come into view",
+        "training": asdict(config),
+        "data": "a grid model of visibility on generated levels, training seeds",
+    }
+    budget = Budget(cpu_seconds=config.cpu_seconds, updates=config.updates)
+    return Trainer(RunDirectory(directory, config), learner, source, budget, cadence, record=record)

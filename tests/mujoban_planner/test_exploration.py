@@ -1,0 +1,120 @@
+"""Where to look before pushing: the grid model of what a camera sees, and the policy that learns in it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from mujoban_core.grid import AGENT, BOX, WALL, Instruction
+from mujoban_core.look_around import LookAroundPlanner, Scout
+from mujoban_planner.boards import abstract_states
+from mujoban_planner.exploration_env import DONE, SHOWN, ExplorationEnvironment, ExplorationReward
+from mujoban_planner.exploration_mpo import ExplorerConfig, explore, judge_scout
+from mujoban_planner.explorer import Explorer
+from mujoban_planner.uncertainty import visible
+from mujoban_rl.testing import check_resuming
+from mujoban_sim.oracles import OraclePlanner
+from mujoban_sokoban.levels import Level, stack_levels
+
+CORNER = """
+##########
+#@   #####
+####   ###
+####   ###
+####   ###
+####.$ ###
+####   ###
+##########
+##########
+##########
+"""
+"""A corridor to the east that ends in a room, of which the start shows a corner at most."""
+
+
+@pytest.fixture
+def environment():
+    states = abstract_states(stack_levels([Level.from_text(CORNER.strip())]))
+    return ExplorationEnvironment(states, np.random.default_rng(0), ExplorationReward(cell=1.0, move=0.25, look=0.5))
+
+
+def test_what_lies_behind_walls_is_a_guess_until_it_comes_into_view(environment):
+    truth = environment.level[0]
+    hidden = visible(environment.level)[0] & ~environment.seen[0]
+    assert hidden[5, 5] and truth[5, 5, BOX] and not hidden[1, 4]
+    state = environment.observe()[0]
+    assert 0.0 < state[5, 5, BOX] < 1.0 and 0.0 < state[5, 5, WALL] < 1.0
+    assert (state[~hidden & visible(environment.level)[0]][:, WALL] % 1.0 == 0.0).all()
+    assert state[1, 1, AGENT] == 1.0 and state[..., AGENT].sum() == 1.0
+
+
+def test_cells_that_come_into_view_are_rewarded_once_and_steps_cost(environment):
+    east, south, stay = (np.array([int(i)]) for i in (Instruction.EAST, Instruction.SOUTH, Instruction.STAY))
+    assert environment.step(stay).reward == -0.5  # the start has been looked at
+    assert environment.step(south).reward == -0.25 and environment.agent.tolist() == [[1, 1]]  # a wall
+    gained = [float(environment.step(east).reward[0]) for _ in range(3)]
+    before = environment.seen.sum()
+    gained.append(float(environment.step(stay).reward[0]))
+    assert gained[-1] == environment.seen.sum() - before - 0.5 > 0
+    assert environment.shown[0, 1, 5] and environment.step(stay).reward == -0.5
+    end = environment.step(np.array([DONE]))
+    assert end.done and end.reward == 0.0
+
+
+def test_an_explorer_steps_only_where_it_believes_the_way_is_free(environment):
+    torch.manual_seed(0)
+    explorer = Explorer(8, 1)
+    state = torch.from_numpy(environment.observe())
+    assert explorer.possible(state)[0].tolist() == [True, False, True, False, False, True]
+    with torch.no_grad():
+        explorer.policy.bias[int(Instruction.SOUTH)] = 100.0
+        explorer.policy.bias[int(Instruction.EAST)] = 50.0
+    seen = environment.observe()[0]
+    assert explorer.step(seen[..., :SHOWN], seen[..., SHOWN] > 0.5) == Instruction.EAST
+    with torch.no_grad():
+        explorer.policy.bias[DONE] = 1000.0
+    assert explorer.step(seen[..., :SHOWN], seen[..., SHOWN] > 0.5) is None
+
+
+def test_a_planner_looks_where_its_scout_says(environment):
+    class Eastward(Scout):
+        def step(self, abstract_state, shown):
+            assert shown[1, 1]
+            return Instruction.EAST if abstract_state[1, 1, AGENT] else None
+
+    planner = LookAroundPlanner(OraclePlanner(), 1, scout=Eastward())
+    truth = environment.level.astype(np.float32)
+    state = planner.initial_state(np.zeros(1, np.int64))
+    said = []
+    for _ in range(2):
+        instruction, state = planner.step(truth, np.ones(1, np.bool_), state)
+        said.append(int(instruction[0]))
+    assert said == [Instruction.STAY, Instruction.EAST]
+
+
+def small(path, **changes):
+    config = ExplorerConfig(
+        channels=8, blocks=1, environments=8, batch_size=16, warm_up_steps=15, replay_steps=60, play=5, n_step=3,
+        **changes,
+    )  # fmt: skip
+    return explore(config, path)
+
+
+def test_runs_resume_to_the_bit_and_leave_an_explorer(tmp_path, monkeypatch):
+    monkeypatch.setattr("mujoban_planner.exploration_mpo._JUDGED", 4)
+    check_resuming(lambda path: small(path, target_period=2), tmp_path, stop_at=3, updates=6)
+    assert (tmp_path / "whole" / "explorer.safetensors").exists()
+
+
+def test_looking_pays_where_it_is_rewarded():
+    class Never(Scout):
+        def step(self, abstract_state, shown):
+            return None
+
+    class Turns(Scout):
+        def step(self, abstract_state, shown):
+            return Instruction.STAY
+
+    reward = ExplorationReward()
+    assert judge_scout(Never(), reward, 4) == {"found": 0.0, "steps": 0.0, "looks": 0.0, "reward": 0.0}
+    assert judge_scout(Turns(), reward, 4)["reward"] < -4.0
