@@ -1,7 +1,8 @@
 """Sokoban levels: one `Level` value, and the Boxoban text format in which levels are read and written.
 
 A level file holds any number of levels, each a header ``; name`` (Boxoban numbers them from 0) and up to ten rows of
-up to ten symbols. The header may be missing; a blank line then ends a level.
+up to ten symbols. The header may be missing; a blank line then ends a level. Headers that `write_levels` writes end in
+a seal, ``[level 1 of 8, sha256 ...]``, by which `read_levels` tells damage that leaves a level valid.
 
 ======  =================  ======  ====================
 symbol  meaning            symbol  meaning
@@ -17,6 +18,8 @@ Shapes: N = `grid.GRID_SIZE`, K boxes, B levels.
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -26,6 +29,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_core.files import write_atomically
 from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
 
 SYMBOLS: Final = "# @$.*+"
@@ -33,6 +37,12 @@ SYMBOLS: Final = "# @$.*+"
 _PLAYER_SYMBOLS: Final = "@+"
 _BOX_SYMBOLS: Final = "$*"
 _TARGET_SYMBOLS: Final = ".*+"
+_DIGITS: Final = 16
+_SEAL: Final = re.compile(rf" \[level \d+ of \d+, sha256 [0-9a-f]{{{_DIGITS}}}\]$")
+_BROKEN: Final = (
+    "name, rows, place or number of levels are not what its header's seal says: expected the file as it was written "
+    "(to edit it, take '[level ...]' out of all headers)"
+)
 
 
 class LevelError(ValueError):
@@ -160,8 +170,13 @@ def read_levels(path: str | PathLike[str]) -> list[Level]:
     except UnicodeDecodeError as error:
         raise LevelError(f"{path}: not a text file: expected levels of the symbols {SYMBOLS!r}") from error
     levels = []
-    for index, (name, rows) in enumerate(_split(lines)):
+    texts = list(_split(lines))
+    sealed = any(_SEAL.search(header) for header, _ in texts)
+    for index, (header, rows) in enumerate(texts):
+        name = _SEAL.sub("", header)
         try:
+            if sealed and header != _seal(name, rows, index, len(texts)):
+                raise LevelError(_BROKEN)
             levels.append(Level(*_parse_rows(rows), name=name))
         except LevelError as error:
             raise LevelError(f"{path}: level {name or index}: {error}") from None
@@ -171,18 +186,27 @@ def read_levels(path: str | PathLike[str]) -> list[Level]:
 
 
 def write_levels(path: str | PathLike[str], levels: Iterable[Level]) -> None:
-    """Write levels in the Boxoban format; a level without a name gets its index.
+    """Write levels in the Boxoban format; a level without a name gets its index. Headers carry seals.
 
     Raises:
         LevelError: If a name spans lines, which the format cannot hold.
+        OSError: If the file cannot be written; the old one stays as it was.
     """
     texts = []
+    levels = list(levels)
     for index, level in enumerate(levels):
         name = level.name.strip() or str(index)
         if len(name.splitlines()) != 1:
             raise LevelError(f"level {index}: name {name!r} spans lines: expected one line")
-        texts.append(f"; {name}\n{level.to_text()}\n")
-    Path(path).write_text("\n".join(texts), encoding="utf-8")
+        text = level.to_text()
+        texts.append(f"; {_seal(name, text.splitlines(), index, len(levels))}\n{text}\n")
+    write_atomically(Path(path), "\n".join(texts).encode())
+
+
+def _seal(name: str, rows: Sequence[str], index: int, count: int) -> str:
+    """Return the header of a level in a file of `count`: its name, its place, and a checksum of name and rows."""
+    digest = hashlib.sha256("\n".join([name, *rows]).encode()).hexdigest()
+    return f"{name} [level {index + 1} of {count}, sha256 {digest[:_DIGITS]}]"
 
 
 def _split(lines: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
