@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
@@ -15,6 +15,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.listening import Received, listen
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
 
@@ -40,7 +41,7 @@ class RecorderNode(Node):
         written: Stamp of the latest tick in the bag [ns].
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Make the bag and start listening.
 
         Raises:
@@ -48,9 +49,9 @@ class RecorderNode(Node):
         """
         super().__init__("recorder", **options)
         fixed = ParameterDescriptor(read_only=True)
-        path: Any = self.declare_parameter("path", "bag", fixed).value
-        episodes_per_file = self.declare_parameter("episodes_per_file", 32, fixed).value
-        about = {name: str(self.declare_parameter(name, "", fixed).value) for name in ("body", "world")}
+        path = declare(self, "path", "bag", fixed)
+        episodes_per_file = declare(self, "episodes_per_file", 32, fixed)
+        about = {name: declare(self, name, "", fixed) for name in ("body", "world")}
         self.counts: Counter[str] = Counter()
         self._bag = BagWriter(
             Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file, flush_after=FLUSH_AFTER,

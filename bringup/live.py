@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Unpack
 
 import numpy as np
 import rerun as rr
@@ -32,6 +32,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import reject
 from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK, Topic
 
@@ -80,14 +81,13 @@ class LiveNode(Node):
         web_port: Port on which the viewer's page is served, or the next free one.
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Open the stream and start listening."""
         super().__init__("live", **options)
         self.counts: Counter[str] = Counter()
         fixed = ParameterDescriptor(read_only=True)
-        save: Any = self.declare_parameter("save", "", fixed).value
-        grpc_port: Any = self.declare_parameter("grpc_port", 9876, fixed).value
-        web_port: Any = self.declare_parameter("web_port", 9090, fixed).value
+        save = declare(self, "save", "", fixed)
+        grpc_port, web_port = declare(self, "grpc_port", 9876, fixed), declare(self, "web_port", 9090, fixed)
         self._stream = rr.RecordingStream(APPLICATION)
         self._period = 0.0 if save else _PERIOD
         if save:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Unpack
 
 import numpy as np
 from mujoban_msgs.msg import EpisodeTruth
@@ -19,6 +19,7 @@ from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import LOG_PERIOD, PublisherWatch, Received, listen
+from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_sokoban.episodes import Episodes
@@ -67,7 +68,7 @@ class MonitorNode(Node):
         counts: Events that a user should know of.
     """
 
-    def __init__(self, episodes: Episodes, **options: Any) -> None:
+    def __init__(self, episodes: Episodes, **options: Unpack[NodeOptions]) -> None:
         """Watch until as many episodes have ended; what another run says of its own is no result of this one."""
         super().__init__("monitor", **options)
         self.episode: EpisodeTruth | None = None

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 from rclpy.serialization import serialize_message
@@ -20,7 +20,7 @@ from mujoban_core.bodies import Body
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.bags.writer import FLUSH_AFTER
-from mujoban_msgs_py.topics import TICK, Topic
+from mujoban_msgs_py.topics import TICK, Message, Topic
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.tick_messages import EpisodeProgress, SimulatorTick, TickComposer, TickLabel
 from mujoban_sokoban.episodes import EpisodeSpec
@@ -129,7 +129,7 @@ class Recorder:
         self._observed(row, SimulatorTick(self._label(row, tick, m), progress, *tick.ending, index))
         row.writer.end_episode()
 
-    def _put(self, row: _Row, messages: Mapping[Topic, Any]) -> None:
+    def _put(self, row: _Row, messages: Mapping[Topic, Message]) -> None:
         for topic, message in messages.items():
             row.writer.write(topic.name, row.stamp, serialize_message(message))
 
@@ -145,7 +145,7 @@ class Recorder:
         self._put(row, {topic: row.composer.compose(topic, tick) for topic in row.composer.topics})
 
 
-def _decided(row: _Row, tick: Tick, m: int) -> dict[Topic, Any]:
+def _decided(row: _Row, tick: Tick, m: int) -> dict[Topic, Message]:
     """Return what the four modules say in a tick."""
     said = tick.decision
     beta = said.termination

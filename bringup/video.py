@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Unpack
 
 import imageio.v2 as imageio
 import numpy as np
@@ -17,6 +17,7 @@ from bringup.overlay import Said, draw
 from mujoban_core.grid import CONTROL_PERIOD
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
+from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
 
@@ -50,7 +51,7 @@ class VideoNode(Node):
         written: Stamp of the latest picture [ns].
     """
 
-    def __init__(self, path: Path, **options: Any) -> None:
+    def __init__(self, path: Path, **options: Unpack[NodeOptions]) -> None:
         """Open the file.
 
         Raises:

@@ -9,7 +9,7 @@ from array import array
 from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import Any, Final
+from typing import Final, Unpack
 
 import numpy as np
 from geometry_msgs.msg import Point, Pose, Vector3
@@ -29,6 +29,7 @@ from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import Received, listen
+from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 
 PREFIX: Final = "/viz"
@@ -52,7 +53,7 @@ class VizNode(Node):
     and, where `tf2_msgs` is installed, `/tf` and `/tf_static` (see `bringup.frames`).
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Start listening."""
         super().__init__("viz", **options)
         self.counts: Counter[str] = Counter()

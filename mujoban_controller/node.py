@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from mujoban_msgs.msg import Episode
 
-from mujoban_core.interfaces import ControllerInput, GroundTruth
+from mujoban_core.interfaces import Controller, ControllerInput, GroundTruth
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 
 
-class ControllerNode(ModuleNode):
+class ControllerNode(ModuleNode[Controller]):
     """Publishes `/torque`; parameters as in `ModuleNode`."""
 
     role = "controller"

@@ -8,7 +8,7 @@ column 0 the westernmost, as in a level text.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any, Final, Protocol, Self, TypeVar
+from typing import Final, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -62,9 +62,9 @@ _HALF: Final = (GRID_SIZE - 1) / 2
 class Arithmetic(Protocol):
     """An array or a tensor."""
 
-    def __add__(self, other: Any, /) -> Self: ...
-    def __sub__(self, other: Any, /) -> Self: ...
-    def __mul__(self, other: Any, /) -> Self: ...
+    def __add__(self, other: Self, /) -> Self: ...
+    def __sub__(self, other: Self, /) -> Self: ...
+    def __mul__(self, other: Self, /) -> Self: ...
 
 
 Values = TypeVar("Values", bound=Arithmetic)

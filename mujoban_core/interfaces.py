@@ -13,12 +13,14 @@ returns its successor, `renew_rows` restarts the rows of episodes that ended. A 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.grid import INSTRUCTION_LIMIT, Instruction
+
+StateT = TypeVar("StateT")
 
 Memory = tuple[Any, ...]
 """A module's recurrent state: arrays or tensors with the batch on the first axis."""
@@ -97,16 +99,19 @@ def put_rows(memory: Memory, rows: NDArray[np.int64], values: Memory) -> Memory:
     return copies
 
 
-def renew_rows(state: Any, fresh: Any, done: NDArray[np.bool_]) -> Any:
+def renew_rows(state: StateT, fresh: StateT, done: NDArray[np.bool_]) -> StateT:
     """Return a state in which the rows of ended episodes come from `fresh`, the others from `state`.
 
     Works on any nesting of tuples and NamedTuples of arrays or tensors, so on every module's state.
     """
+    return _renewed(state, fresh, np.flatnonzero(done))
+
+
+def _renewed(state: Any, fresh: Any, rows: NDArray[np.int64]) -> Any:
     if isinstance(state, tuple):
-        parts = [renew_rows(s, f, done) for s, f in zip(state, fresh, strict=True)]
+        parts = [_renewed(s, f, rows) for s, f in zip(state, fresh, strict=True)]
         return type(state)(*parts) if hasattr(state, "_fields") else tuple(parts)
     renewed = state.copy() if isinstance(state, np.ndarray) else state.clone()
-    rows = np.flatnonzero(done)
     renewed[rows] = fresh[rows]
     return renewed
 
@@ -149,13 +154,13 @@ class Module(ABC):
     def initial_memory(self, batch: int) -> Memory:
         """Return the memory of `batch` robots at the start of an episode."""
 
-
-class Estimator(Module):
-    """Sense: (o_cam, o_pos) -> estimate of s_abst (paper C.1)."""
-
     def initial_state(self, seeds: NDArray[np.int64]) -> Memory:
         """Return the state at the start of episodes with the given seeds, [B]."""
         return self.initial_memory(len(seeds))
+
+
+class Estimator(Module):
+    """Sense: (o_cam, o_pos) -> estimate of s_abst (paper C.1)."""
 
     @abstractmethod
     def step(self, inputs: EstimatorInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
@@ -290,10 +295,6 @@ class Planner(Module):
 
 class Controller(Module):
     """Act: (A, o_cam, o_pr, beta) -> motor torques (paper C.3)."""
-
-    def initial_state(self, seeds: NDArray[np.int64]) -> Memory:
-        """Return the state at the start of episodes with the given seeds, [B]."""
-        return self.initial_memory(len(seeds))
 
     @abstractmethod
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:

@@ -12,7 +12,7 @@ import importlib
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from mujoban_core.agent import Agent
 from mujoban_core.interfaces import Controller, Estimator, Module, Planner, Termination
@@ -85,6 +85,8 @@ def load_scout(source: str, weights: Path | None = None, device: str = "cpu") ->
 
 def _make(role: str, interface: type[Made], source: str, weights: Path | None, device: str) -> Made:
     make = _resolve(source) if ":" in source else _load(role, source)
+    if not callable(make):
+        raise PluginError(f"{source} is a {type(make).__name__}: expected a class or a function that makes a {role}")
     module = make() if ":" in source or isinstance(make, type) else make(weights, device)
     if not isinstance(module, interface):
         expected = f"{interface.__module__}.{interface.__name__}"
@@ -101,7 +103,7 @@ def shipped_weights(role: str) -> Path:
     """Return where the weights of the learned module for a role are."""
     if role != SCOUT:
         _interface(role)
-    return Path(_load(role, _SHIPPED))
+    return Path(str(_load(role, _SHIPPED)))
 
 
 def _interface(role: str) -> type[Module]:
@@ -117,7 +119,7 @@ def _offered() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
-def _load(role: str, name: str) -> Any:
+def _load(role: str, name: str) -> object:
     """Return what the entry point `ROLE.NAME` leads to."""
     entry = _offered().get(f"{role}.{name}")
     if entry is None:
@@ -130,7 +132,7 @@ def _load(role: str, name: str) -> Any:
         raise PluginError(f"{role} {name!r} ({entry.value}): {error}") from error
 
 
-def _resolve(name: str) -> Any:
+def _resolve(name: str) -> object:
     module, colon, attribute = name.partition(":")
     if not (module and colon and attribute):
         raise PluginError(f"{name!r} names no class: expected package.module:Class")

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
-from typing import Any, Final, NoReturn, Self
+from typing import Final, NoReturn, Self
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, a polite kill, a terminal that was closed."""
@@ -80,6 +80,9 @@ def interruptible() -> Iterator[None]:
         _put_back(before)
 
 
+_Handler = Callable[[int, FrameType | None], object] | int | None
+
+
 class StopSignal:
     """Context in which a signal asks the work to end instead of cutting it short.
 
@@ -96,7 +99,7 @@ class StopSignal:
         self.number: int | None = None
         self._at = 0.0
         self._raised = False
-        self._before: dict[signal.Signals, Any] = {}
+        self._before: dict[signal.Signals, _Handler] = {}
 
     @property
     def requested(self) -> bool:
@@ -166,7 +169,7 @@ class StopSignal:
             raise Interrupted(self.number) from value
 
 
-def _handle(handler: Callable[[int, FrameType | None], None]) -> dict[signal.Signals, Any]:
+def _handle(handler: Callable[[int, FrameType | None], None]) -> dict[signal.Signals, _Handler]:
     """Install a handler and return those before it; a SIGHUP that is ignored, as under nohup, stays so."""
     if threading.current_thread() is not threading.main_thread():
         return {}
@@ -174,6 +177,6 @@ def _handle(handler: Callable[[int, FrameType | None], None]) -> dict[signal.Sig
     return {number: signal.signal(number, handler) for number in handled}
 
 
-def _put_back(handlers: dict[signal.Signals, Any]) -> None:
+def _put_back(handlers: dict[signal.Signals, _Handler]) -> None:
     for number, handler in handlers.items():
         signal.signal(number, handler)

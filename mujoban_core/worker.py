@@ -8,8 +8,9 @@ import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
 from queue import SimpleQueue
-from typing import Any, TypeVar
+from typing import ParamSpec, TypeVar
 
+_P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
@@ -27,13 +28,13 @@ class Worker:
         self._thread.start()
         _WORKERS.add(self)
 
-    def submit(self, function: Callable[..., _T], *args: Any) -> Future[_T]:
+    def submit(self, function: Callable[_P, _T], *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
         """Run a function in the thread, after those before it."""
         future: Future[_T] = Future()
 
         def job() -> None:
             try:
-                future.set_result(function(*args))
+                future.set_result(function(*args, **kwargs))
             except BaseException as error:
                 future.set_exception(error)
 

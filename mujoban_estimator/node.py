@@ -7,14 +7,14 @@ from typing import Any
 
 from mujoban_msgs.msg import Episode
 
-from mujoban_core.interfaces import EstimatorInput, GroundTruth
+from mujoban_core.interfaces import Estimator, EstimatorInput, GroundTruth
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 
 
-class EstimatorNode(ModuleNode):
+class EstimatorNode(ModuleNode[Estimator]):
     """Publishes `/abstract_state`; parameters as in `ModuleNode`."""
 
     role = "estimator"

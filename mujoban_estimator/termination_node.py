@@ -6,18 +6,18 @@ Run it with `python -m mujoban_estimator.termination_node`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from mujoban_msgs.msg import Episode
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 
-from mujoban_core.interfaces import NO_INSTRUCTION, GroundTruth, TerminationInput, check_termination
+from mujoban_core.interfaces import NO_INSTRUCTION, GroundTruth, Termination, TerminationInput, check_termination
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
-from mujoban_msgs_py.runtime.descriptors import described
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, described
 from mujoban_msgs_py.runtime.module_node import MOST_TICKS, ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 
@@ -30,7 +30,7 @@ _SETTINGS = {
 }
 
 
-class TerminationNode(ModuleNode):
+class TerminationNode(ModuleNode[Termination]):
     """Publishes `/termination`.
 
     Parameters, besides those of `ModuleNode`, all settable while it runs:
@@ -46,7 +46,7 @@ class TerminationNode(ModuleNode):
     )
     output = topics.TERMINATION
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Load the module and start listening."""
         super().__init__(**options)
         self._said: dict[int, conversions.InstructionReading] = {}

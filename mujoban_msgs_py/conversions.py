@@ -27,6 +27,7 @@ from mujoban_core.bodies import BODIES, ProprioSlices
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, DIFFICULTIES, GRID_SIZE
 from mujoban_core.grid import Instruction as Direction
+from mujoban_msgs_py.topics import Message
 
 ENCODING: Final = "rgb8"
 _SECOND: Final = 1_000_000_000
@@ -46,7 +47,7 @@ def time_to_msg(stamp: int) -> Time:
     return Time(sec=stamp // _SECOND, nanosec=stamp % _SECOND)
 
 
-def time_from_msg(message: Any) -> int:
+def time_from_msg(message: Time) -> int:
     """Return a time in nanoseconds."""
     return message.sec * _SECOND + message.nanosec
 
@@ -56,9 +57,9 @@ def header(stamp: int, frame_id: str = "") -> Header:
     return Header(stamp=time_to_msg(stamp), frame_id=frame_id)
 
 
-def stamp_of(message: Any) -> int:
+def stamp_of(message: Message | Header) -> int:
     """Return the stamp of a message with a header, of a header or of a clock, in nanoseconds."""
-    stamped = getattr(message, "header", message)
+    stamped: Any = getattr(message, "header", message)
     return time_from_msg(stamped.stamp if hasattr(stamped, "stamp") else stamped.clock)
 
 
@@ -75,12 +76,11 @@ def frame_to_msg(header: Header, frame: NDArray[np.uint8]) -> Image:
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
         raise ConversionError(f"frame must be uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
     height, width, _ = frame.shape
-    return Image(
-        header=header, height=height, width=width, encoding=ENCODING, step=3 * width, data=array("B", frame.tobytes())
-    )
+    data = array("B", frame.tobytes())
+    return Image(header=header, height=height, width=width, encoding=ENCODING, step=3 * width, data=data)
 
 
-def frame_from_msg(message: Any, size: int | None = FRAME_SIZE) -> NDArray[np.uint8]:
+def frame_from_msg(message: Image, size: int | None = FRAME_SIZE) -> NDArray[np.uint8]:
     """Return the pixels of an rgb8 image, [H, W, 3]; H = W = `size` unless that is None."""
     if message.encoding != ENCODING:
         raise ConversionError(f"image encoding must be {ENCODING!r}, got {message.encoding!r}")
@@ -112,7 +112,7 @@ def camera_info_to_msg(header: Header, intrinsics: ArrayLike, size: int = FRAME_
     )
 
 
-def camera_info_from_msg(message: Any) -> NDArray[np.float64]:
+def camera_info_from_msg(message: CameraInfo) -> NDArray[np.float64]:
     """Return the intrinsic matrix K, [3, 3]."""
     return _finite("k", message.k, (9,), np.float64).reshape(3, 3)
 
@@ -133,7 +133,7 @@ def proprio_to_msg(header: Header, proprio: ArrayLike, joints: Sequence[str]) ->
     )
 
 
-def proprio_from_msg(message: Any) -> NDArray[np.float32]:
+def proprio_from_msg(message: Proprioception) -> NDArray[np.float32]:
     """Return o_pr, [P], in the layout of `mujoban_core.bodies.ProprioSlices`."""
     count = len(message.name)
     if not len(message.position) == len(message.velocity) == count:
@@ -147,7 +147,7 @@ def proprio_from_msg(message: Any) -> NDArray[np.float32]:
     return _finite("proprioception", values, (ProprioSlices.of(count).size,), np.float32)
 
 
-def body_proprio_from_msg(message: Any) -> NDArray[np.float32]:
+def body_proprio_from_msg(message: Proprioception) -> NDArray[np.float32]:
     """Return o_pr, [P], of one of `mujoban_core.bodies.BODIES`."""
     if tuple(message.name) not in {body.joints for body in BODIES.values()}:
         known = "; ".join(f"{', '.join(body.joints)} ({name})" for name, body in BODIES.items())
@@ -162,7 +162,7 @@ def pose_to_msg(header: Header, pose: ArrayLike) -> PoseStamped:
     return PoseStamped(header=header, pose=Pose(position=Point(x=x, y=y), orientation=orientation))
 
 
-def pose_from_msg(message: Any) -> NDArray[np.float32]:
+def pose_from_msg(message: PoseStamped) -> NDArray[np.float32]:
     """Return (x [m], y [m], psi [rad]), [3]; psi in [-pi, pi], as far as float32 has these bounds."""
     p, q = message.pose.position, message.pose.orientation
     norm = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w
@@ -190,7 +190,7 @@ def abstract_state_to_msg(header: Header, state: NDArray[np.float32]) -> Abstrac
     return AbstractState(header=header, rows=state.shape[0], cols=state.shape[1], **fields)
 
 
-def abstract_state_from_msg(message: Any, size: int | None = GRID_SIZE) -> NDArray[np.float32]:
+def abstract_state_from_msg(message: AbstractState, size: int | None = GRID_SIZE) -> NDArray[np.float32]:
     """Return probabilities [rows, columns, 4]; rows = columns = `size` unless that is None."""
     rows, cols = message.rows, message.cols
     if size is not None and (rows, cols) != (size, size):
@@ -217,7 +217,7 @@ def instruction_to_msg(header: Header, sequence: int, direction: int) -> Instruc
     return Instruction(header=header, sequence=int(sequence), direction=_direction(direction))
 
 
-def instruction_from_msg(message: Any) -> InstructionReading:
+def instruction_from_msg(message: Instruction) -> InstructionReading:
     """Return A and its number in the episode."""
     return InstructionReading(message.sequence, _direction(message.direction))
 
@@ -244,7 +244,7 @@ def termination_to_msg(
     )
 
 
-def termination_from_msg(message: Any) -> TerminationReading:
+def termination_from_msg(message: Termination) -> TerminationReading:
     """Return beta, its probability and what it is about."""
     probability = _probability(message.probability)
     return TerminationReading(message.sequence, probability, bool(message.terminated), bool(message.timed_out))
@@ -256,7 +256,7 @@ def torque_to_msg(header: Header, torque: ArrayLike, joints: Sequence[str] = ())
     return JointState(header=header, name=list(joints), effort=array("d", values.tobytes()))
 
 
-def torque_from_msg(message: Any, size: int | None = None) -> NDArray[np.float32]:
+def torque_from_msg(message: JointState, size: int | None = None) -> NDArray[np.float32]:
     """Return torques normalised to [-1, 1], [U]; U = `size` unless that is None."""
     return _torque(message.effort, size)
 
@@ -272,7 +272,7 @@ def twist_to_msg(header: Header, velocity: ArrayLike) -> TwistStamped:
     return message
 
 
-def twist_from_msg(message: Any) -> NDArray[np.float32]:
+def twist_from_msg(message: TwistStamped) -> NDArray[np.float32]:
     """Return (vx [m/s], vy [m/s], yaw rate [rad/s]) in the map frame, [3]."""
     linear, angular = message.twist.linear, message.twist.angular
     return _finite("velocity", (linear.x, linear.y, angular.z), (3,), np.float32)
@@ -284,7 +284,7 @@ def boxes_to_msg(header: Header, position: ArrayLike) -> PoseArray:
     return PoseArray(header=header, poses=[Pose(position=Point(x=x, y=y)) for x, y in centres])
 
 
-def boxes_from_msg(message: Any) -> NDArray[np.float32]:
+def boxes_from_msg(message: PoseArray) -> NDArray[np.float32]:
     """Return o_box, box centres in the map frame [m], [K, 2]."""
     centres = np.array([(p.position.x, p.position.y) for p in message.poses], np.float64).reshape(-1, 2)
     return _finite("box positions", centres, (None, 2), np.float32)
@@ -303,7 +303,7 @@ def episode_to_msg(header: Header, reading: EpisodeReading) -> Episode:
     return Episode(header=header, episode=int(reading.episode), step=int(reading.step), ended=bool(reading.ended))
 
 
-def episode_from_msg(message: Any) -> EpisodeReading:
+def episode_from_msg(message: Episode) -> EpisodeReading:
     """Return what every node may know of an episode."""
     return EpisodeReading(message.episode, message.step, message.ended)
 
@@ -343,7 +343,7 @@ def episode_truth_to_msg(header: Header, reading: EpisodeTruthReading) -> Episod
     )
 
 
-def episode_truth_from_msg(message: Any) -> EpisodeTruthReading:
+def episode_truth_from_msg(message: EpisodeTruth) -> EpisodeTruthReading:
     """Return the truth about an episode."""
     reading = EpisodeTruthReading(*(getattr(message, name) for name in EpisodeTruthReading._fields))
     _finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float64)

@@ -9,14 +9,18 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image
+
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.topics import Topic
+from mujoban_msgs_py.topics import Message, Topic
 
 Decode = Callable[[Any], Any]
 """Turns a message into a value, or raises `conversions.ConversionError`."""
 
 
-def _any_size(message: Any) -> Any:
+def _any_size(message: Image) -> NDArray[np.uint8]:
     return conversions.frame_from_msg(message, None)
 
 
@@ -48,7 +52,7 @@ def checked(topic: Topic) -> Decode:
     """Return a function that returns a message as it is, after a look at whether its topic's reader takes it."""
     decode = DECODERS[topic]
 
-    def check(message: Any) -> Any:
+    def check(message: Message) -> Message:
         decode(message)
         return message
 

@@ -13,6 +13,8 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message
 
+from mujoban_msgs_py.topics import Message
+
 _LITTLE_ENDIAN = 1
 _ENCAPSULATION = 4
 """Bytes before the first field of a message in CDR."""
@@ -37,7 +39,7 @@ def raw_stamp(message: bytes) -> int:
 
 
 @lru_cache(maxsize=_REMEMBERED)
-def read(message: bytes, kind: type[Any], decode: Callable[[Any], Any] | None = None) -> Any:
+def read(message: bytes, kind: type[Message], decode: Callable[[Any], Any] | None = None) -> Any:
     """Return what a serialised message holds; the result is shared, so leave it as it is.
 
     Args:
@@ -66,7 +68,7 @@ def _after_header(message: bytes) -> int:
 class Steady:
     """Reads a topic that says the same for many ticks: where only the header is new, nothing is deserialised."""
 
-    def __init__(self, kind: type[Any], decode: Callable[[Any], Any]) -> None:
+    def __init__(self, kind: type[Message], decode: Callable[[Any], Any]) -> None:
         """Read messages whose first field is a header, by a function that leaves the header out."""
         self._kind, self._decode = kind, decode
         self._said = b""

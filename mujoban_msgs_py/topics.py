@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from geometry_msgs.msg import PoseArray, PoseStamped, TwistStamped
 from mujoban_msgs.msg import AbstractState, Episode, EpisodeTruth, Instruction, Proprioception, Termination
@@ -38,12 +38,21 @@ BODY_FRAME: Final = "base_link"
 """The robot: on the floor below its vertical axis, x along its heading."""
 
 
+class Message(Protocol):
+    """A ROS message of whatever type."""
+
+    @classmethod
+    def get_fields_and_field_types(cls) -> dict[str, str]:
+        """Return the type of each field by name."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Topic:
     """A topic of the graph."""
 
     name: str
-    type: type[Any]
+    type: type[Message]
     latched: bool = False
     """Whether those who join late receive the latest message."""
 

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from mujoban_msgs.msg import Episode
 
-from mujoban_core.interfaces import GroundTruth
+from mujoban_core.interfaces import GroundTruth, Module, Planner
 from mujoban_core.look_around import Scout
 from mujoban_core.plugins import SCRIPTED, load_scout
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.runtime.descriptors import described
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 from mujoban_planner.lookahead import MOST_EVALUATIONS, look_ahead
 
 
-class PlannerNode(ModuleNode):
+class PlannerNode(ModuleNode[Planner]):
     """Publishes `/instruction` in every tick.
 
     Parameters, beside those of `ModuleNode`:
@@ -39,18 +39,17 @@ class PlannerNode(ModuleNode):
     truth_inputs = ()
     """A planner, also the oracle, goes by the abstract state that it is given."""
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Load the module and start listening."""
         self._look_ahead: int | None = None
         self._scout: Scout | None = None
         super().__init__(**options)
 
-    def prepare(self, module: Any) -> Any:
+    def prepare(self, module: Module) -> Module:
         """Let the planner look ahead, if it is to."""
         if self._look_ahead is None:
             about = described("evaluations of a search ahead; 0: none", fixed=True, low=0, high=MOST_EVALUATIONS)
-            value: Any = self.declare_parameter("look_ahead", 0, about).value
-            self._look_ahead = value
+            self._look_ahead = declare(self, "look_ahead", 0, about)
         return look_ahead(module, self._look_ahead or 0)
 
     @property
@@ -58,9 +57,9 @@ class PlannerNode(ModuleNode):
         """What says where to look."""
         if self._scout is None:
             which = described("scripted, learned or package.module:Class", fixed=True)
-            source: Any = self.declare_parameter("scout", SCRIPTED, which).value
+            source = declare(self, "scout", SCRIPTED, which)
             file = described("weights file of the learned scout; empty: those that ship", fixed=True)
-            weights: Any = self.declare_parameter("scout_weights", "", file).value
+            weights = declare(self, "scout_weights", "", file)
             self._scout = load_scout(source, Path(weights) if weights else None)
         return self._scout
 

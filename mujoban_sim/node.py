@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
+from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.kept import KeptArrays
 from mujoban_msgs_py.runtime.pace import Pace
@@ -80,7 +81,7 @@ class SimulatorNode(Node):
         ticks: Steps of the world so far.
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Read the parameters and make the world; the first tick follows once the graph is complete.
 
         Raises:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
+from sensor_msgs.msg import Image
 
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py import conversions, topics
@@ -78,6 +77,6 @@ class ObservationPublisher:
             self._top_period = GLANCE if glances and len(known) == readers else 1
         return stamp // topics.TICK % self._top_period == 0
 
-    def _top_camera(self, label: TickLabel) -> Any:
+    def _top_camera(self, label: TickLabel) -> Image:
         frame = self._world.render("top_down", size=self._top_camera_size)[0]
         return conversions.frame_to_msg(conversions.header(label.stamp, topics.TOP_CAMERA_FRAME), frame)

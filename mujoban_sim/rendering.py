@@ -11,7 +11,7 @@ import os
 import weakref
 from collections.abc import Sequence
 from concurrent.futures import Future
-from typing import Any, Final, Literal
+from typing import Final, Literal, Protocol
 
 import mujoco
 import numpy as np
@@ -43,7 +43,19 @@ class RenderingError(OSError):
     """There is no OpenGL to draw with."""
 
 
-def open_context(size: int) -> Any:
+class GLContext(Protocol):
+    """An offscreen OpenGL context, of whichever of MuJoCo's backends."""
+
+    def make_current(self) -> None:
+        """Draw with it in the calling thread from now on."""
+        ...
+
+    def free(self) -> None:
+        """Give it back."""
+        ...
+
+
+def open_context(size: int) -> GLContext:
     """Open an offscreen OpenGL context and make it current in the calling thread.
 
     The variable MUJOCO_GL chooses the library (``egl``, the default, ``osmesa`` or ``glfw``). Mesa's software

@@ -6,14 +6,19 @@ Nothing here needs rclpy.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from geometry_msgs.msg import PoseArray
+from mujoban_msgs.msg import AbstractState, Episode, EpisodeTruth, Proprioception, Termination
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
 
 from mujoban_core.bodies import Body
 from mujoban_core.camera import camera_intrinsics
 from mujoban_core.grid import BOX, TARGET
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.topics import Topic
+from mujoban_msgs_py.topics import Message, Topic
 from mujoban_sokoban.episodes import EpisodeSpec
 
 
@@ -61,7 +66,7 @@ class TickComposer:
         self._intrinsics = camera_intrinsics(body.camera)
         self._spec: EpisodeSpec | None = None
         self._level_text = ""
-        self._composers: dict[Topic, Callable[[SimulatorTick], Any]] = {
+        self._composers: dict[Topic, Callable[[SimulatorTick], Message]] = {
             topics.CLOCK: lambda tick: conversions.clock_to_msg(tick.label.stamp),
             topics.EPISODE: self._episode,
             topics.CAMERA: self._camera,
@@ -78,7 +83,7 @@ class TickComposer:
         self.topics = tuple(self._composers)
         """In the order in which the simulator speaks."""
 
-    def compose(self, topic: Topic, tick: SimulatorTick) -> Any:
+    def compose(self, topic: Topic, tick: SimulatorTick) -> Message:
         """Return the message of a topic.
 
         Raises:
@@ -87,12 +92,12 @@ class TickComposer:
         """
         return self._composers[topic](tick)
 
-    def _episode(self, tick: SimulatorTick) -> Any:
+    def _episode(self, tick: SimulatorTick) -> Episode:
         progress = tick.progress
         reading = conversions.EpisodeReading(tick.label.episode, progress.step, progress.solved or progress.truncated)
         return conversions.episode_to_msg(_map(tick), reading)
 
-    def _true_episode(self, tick: SimulatorTick) -> Any:
+    def _true_episode(self, tick: SimulatorTick) -> EpisodeTruth:
         label, progress = tick.label, tick.progress
         if progress.spec is not self._spec:
             self._spec, self._level_text = progress.spec, progress.spec.level.to_text()
@@ -112,29 +117,29 @@ class TickComposer:
         )
         return conversions.episode_truth_to_msg(_map(tick), reading)
 
-    def _camera(self, tick: SimulatorTick) -> Any:
+    def _camera(self, tick: SimulatorTick) -> Image:
         header = conversions.header(tick.label.stamp, topics.CAMERA_FRAME)
         return conversions.frame_to_msg(header, tick.observation.frame[tick.row])
 
-    def _camera_info(self, tick: SimulatorTick) -> Any:
+    def _camera_info(self, tick: SimulatorTick) -> CameraInfo:
         header = conversions.header(tick.label.stamp, topics.CAMERA_FRAME)
         return conversions.camera_info_to_msg(header, self._intrinsics)
 
-    def _proprio(self, tick: SimulatorTick) -> Any:
+    def _proprio(self, tick: SimulatorTick) -> Proprioception:
         header = conversions.header(tick.label.stamp, topics.BODY_FRAME)
         return conversions.proprio_to_msg(header, tick.observation.proprio[tick.row], self._joints)
 
-    def _abstract_state(self, tick: SimulatorTick) -> Any:
+    def _abstract_state(self, tick: SimulatorTick) -> AbstractState:
         return conversions.abstract_state_to_msg(_map(tick), tick.truth.abstract_state[tick.row])
 
-    def _boxes(self, tick: SimulatorTick) -> Any:
+    def _boxes(self, tick: SimulatorTick) -> PoseArray:
         present = tick.truth.box_position[tick.row, : len(tick.progress.spec.level.boxes)]
         return conversions.boxes_to_msg(_map(tick), present)
 
-    def _termination(self, tick: SimulatorTick) -> Any:
+    def _termination(self, tick: SimulatorTick) -> Termination:
         completed = bool(tick.truth.completed[tick.row])
         return conversions.termination_to_msg(_map(tick), tick.label.sequence, float(completed), completed)
 
 
-def _map(tick: SimulatorTick) -> Any:
+def _map(tick: SimulatorTick) -> Header:
     return conversions.header(tick.label.stamp, topics.MAP_FRAME)

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from mcap.exceptions import McapError
 from mcap.records import Chunk, Metadata
@@ -45,7 +45,7 @@ class HashedFile:
         """Return how many bytes were written."""
         return self._file.tell()
 
-    def write(self, data: Any) -> int:
+    def write(self, data: bytes | bytearray | memoryview) -> int:
         """Write all of `data`."""
         view = memoryview(data).cast("B")
         done = 0

@@ -158,11 +158,11 @@ _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 class _Dumper(_SafeDumper):
     """Writes every QoS profile out: rosbag2's own parser knows no YAML aliases."""
 
-    def ignore_aliases(self, data: Any) -> bool:
+    def ignore_aliases(self, data: object) -> bool:
         return True
 
 
-def _dump(content: Any) -> str:
+def _dump(content: object) -> str:
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
 
 
@@ -181,13 +181,13 @@ def load_qos(text: str | Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [dict(p) for p in profiles or []]
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is no text")
     return value
 
 
-def _count(value: Any) -> int:
+def _count(value: object) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise TypeError(f"{value!r} is no count")
     return value

@@ -7,17 +7,18 @@ import shutil
 import sys
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from mujoban_msgs_py.bags import open_bag, recover_bag
 from mujoban_msgs_py.bags.metadata import DISTRIBUTION
 from mujoban_msgs_py.ros2 import bag_play, bag_record
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 _UNITS: Final = ("B", "KiB", "MiB", "GiB", "TiB")
 _INDENT: Final = " " * 19
 
 
-def add_verbs(commands: Any) -> None:
+def add_verbs(commands: Verbs) -> None:
     """Add the family to the parser."""
     family = commands.add_parser("bag", help="Various rosbag related sub-commands")
     verbs = family.add_subparsers(title="Commands", metavar="verb", required=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -15,6 +15,7 @@ from rosgraph_msgs.msg import Clock
 from mujoban_msgs_py.bags import Bag, BagMessage, TopicInfo, open_bag
 from mujoban_msgs_py.conversions import clock_to_msg
 from mujoban_msgs_py.ros2.session import CommandError, Session, full_name, import_type, make_qos
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 MATCH_LIMIT: Final = 5.0
 """Seconds within which known subscribers have to be matched before the first message is sent."""
@@ -22,7 +23,7 @@ DEPTH: Final = 1000
 """Messages kept for slow subscribers."""
 
 
-def add_verb(verbs: Any) -> None:
+def add_verb(verbs: Verbs) -> None:
     """Add the verb to the parser."""
     parser = verbs.add_parser("play", help="Play back ROS data from a bag")
     parser.add_argument("bag_path", help="Bag to open")

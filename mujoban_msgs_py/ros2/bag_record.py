@@ -7,7 +7,7 @@ import re
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from mujoban_msgs_py.bags import BagError, BagWriter
 from mujoban_msgs_py.bags.metadata import qos_profile
@@ -20,12 +20,13 @@ from mujoban_msgs_py.ros2.session import (
     make_qos,
     qos_of_publishers,
 )
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 DEPTH: Final = 1000
 """Messages kept for the recorder while it writes a chunk."""
 
 
-def add_verb(verbs: Any) -> None:
+def add_verb(verbs: Verbs) -> None:
     """Add the verb to the parser."""
     parser = verbs.add_parser("record", help="Record ROS data to a bag")
     parser.add_argument("topics", nargs="*", help="Topics to be recorded")

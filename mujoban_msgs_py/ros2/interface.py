@@ -8,17 +8,18 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from mujoban_msgs_py.bags.types import MESSAGES, PACKAGE
 from mujoban_msgs_py.ros2.session import CommandError
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 KINDS: Final = {"msg": "Messages", "srv": "Services", "action": "Actions"}
 _FIELD: Final = re.compile(r"^\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[a-z]\w*")
 _PRIMITIVES: Final = re.compile(r"^(bool|byte|char|w?string|float(32|64)|u?int(8|16|32|64))$")
 
 
-def add_verbs(commands: Any) -> None:
+def add_verbs(commands: Verbs) -> None:
     """Add the family to the parser."""
     family = commands.add_parser("interface", help="Show information about ROS interfaces")
     verbs = family.add_subparsers(title="Commands", metavar="verb", required=True)

@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import array
 import re
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 import numpy as np
 import yaml
+from builtin_interfaces.msg import Time
 
 from mujoban_msgs_py.ros2.session import CommandError, import_type
+from mujoban_msgs_py.topics import Message
 
 _SEQUENCE: Final = re.compile(r"^sequence<(?P<element>.+?)(?:,\s*\d+)?>$|^(?P<fixed>.+)\[\d+\]$")
 _FLOATS: Final = ("float", "double")
 
 
-def is_message(value: Any) -> bool:
+def is_message(value: object) -> TypeGuard[Message]:
     """Return whether a value is a ROS message."""
     return hasattr(value, "get_fields_and_field_types")
 
 
 def to_yaml(
-    message: Any, *, truncate: int | None = 128, no_arr: bool = False, no_str: bool = False, flow_style: bool = False
+    message: Message,
+    *,
+    truncate: int | None = 128,
+    no_arr: bool = False,
+    no_str: bool = False,
+    flow_style: bool = False,
 ) -> str:
     """Return a message as YAML.
 
@@ -38,7 +45,7 @@ def to_yaml(
     )
 
 
-def to_csv(message: Any, *, truncate: int | None = 128, no_arr: bool = False, no_str: bool = False) -> str:
+def to_csv(message: object, *, truncate: int | None = 128, no_arr: bool = False, no_str: bool = False) -> str:
     """Return a message as one line of comma-separated values."""
     return ",".join(str(leaf) for leaf in _leaves(_plain(message, "", truncate, no_arr, no_str)))
 
@@ -89,7 +96,7 @@ def parse_values(text: str) -> dict[str, Any]:
     return values
 
 
-def fill(message: Any, values: dict[str, Any], now: Any = None) -> None:
+def fill(message: Message, values: dict[str, Any], now: Time | None = None) -> None:
     """Set fields of a message.
 
     Args:
@@ -112,7 +119,7 @@ def fill(message: Any, values: dict[str, Any], now: Any = None) -> None:
             raise CommandError(f"{value!r} does not fit field '{name}' of type {kinds[name]}") from None
 
 
-def _convert(value: Any, kind: str, now: Any) -> Any:
+def _convert(value: Any, kind: str, now: Time | None) -> Any:
     """Return a value as the field of a message takes it."""
     sequence = _SEQUENCE.match(kind)
     if sequence:

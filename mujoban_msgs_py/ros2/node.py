@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
-from typing import Any
 
 from mujoban_msgs_py.ros2.session import CommandError, Session, add_discovery_options, full_name, is_hidden
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 ACTION_PARTS = ("/_action/feedback", "/_action/status", "/_action/send_goal", "/_action/cancel_goal")
 
 
-def add_verbs(commands: Any) -> None:
+def add_verbs(commands: Verbs) -> None:
     """Add the family to the parser."""
     family = commands.add_parser("node", help="Various node related sub-commands")
     verbs = family.add_subparsers(title="Commands", metavar="verb", required=True)

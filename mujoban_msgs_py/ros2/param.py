@@ -14,6 +14,7 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from mujoban_msgs_py.ros2.node import find_node, node_names
 from mujoban_msgs_py.ros2.session import CommandError, Session, add_discovery_options, full_name
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 ANSWER_LIMIT: Final = 5.0
 """Seconds within which a node has to answer."""
@@ -44,7 +45,7 @@ _TYPE_NAMES: Final = {
 }
 
 
-def add_verbs(commands: Any) -> None:
+def add_verbs(commands: Verbs) -> None:
     """Add the family to the parser."""
     family = commands.add_parser("param", help="Various param related sub-commands")
     verbs = family.add_subparsers(title="Commands", metavar="verb", required=True)
@@ -68,7 +69,7 @@ def add_verbs(commands: Any) -> None:
     _add_looks(verbs)
 
 
-def _add_looks(verbs: Any) -> None:
+def _add_looks(verbs: Verbs) -> None:
     parser = verbs.add_parser("describe", help="Show descriptive information about declared parameters")
     parser.add_argument("node_name", help="Name of the ROS node")
     parser.add_argument("parameter_names", nargs="+", help="Names of the parameters")

@@ -14,9 +14,10 @@ from mujoban_msgs_py.ros2.session import (
     import_type,
     is_hidden,
 )
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 
-def add_verbs(commands: Any) -> None:
+def add_verbs(commands: Verbs) -> None:
     """Add the family to the parser."""
     family = commands.add_parser("service", help="Various service related sub-commands")
     verbs = family.add_subparsers(title="Commands", metavar="verb", required=True)

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import rclpy
 from rclpy.executors import Executor
@@ -24,6 +24,9 @@ QUIET_TIME: Final = 0.7
 """Seconds without a change after which the graph counts as discovered."""
 STEP: Final = 0.05
 """Seconds for which the executor may wait without looking at interruptions."""
+
+
+FoundT = TypeVar("FoundT")
 
 
 class CommandError(ValueError):
@@ -79,7 +82,7 @@ class Session:
         """Spin for some time."""
         self.until(lambda: False, seconds)
 
-    def settle(self, graph: Callable[[], Any]) -> Any:
+    def settle(self, graph: Callable[[], FoundT]) -> FoundT:
         """Return what `graph` says once others are there and it has stopped changing, or after `--spin-time`."""
         if self._spin_time is not None:
             self.spin_for(self._spin_time)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 from mujoban_msgs_py.ros2 import topic_echo, topic_measure, topic_pub
 from mujoban_msgs_py.ros2.session import (
@@ -12,9 +11,10 @@ from mujoban_msgs_py.ros2.session import (
     full_name,
     is_hidden,
 )
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 
-def add_verbs(commands: Any) -> None:
+def add_verbs(commands: Verbs) -> None:
     """Add the family to the parser."""
     family = commands.add_parser("topic", help="Various topic related sub-commands")
     verbs = family.add_subparsers(title="Commands", metavar="verb", required=True)

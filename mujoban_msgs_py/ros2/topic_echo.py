@@ -17,9 +17,10 @@ from mujoban_msgs_py.ros2.session import (
     import_type,
     qos_of_publishers,
 )
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 
-def add_verb(verbs: Any) -> None:
+def add_verb(verbs: Verbs) -> None:
     """Add the verb to the parser."""
     parser = verbs.add_parser("echo", help="Output messages from a topic")
     parser.add_argument("topic_name", help="Name of the topic to listen to (e.g. '/chatter')")
@@ -59,7 +60,7 @@ class Printer:
         self._flow_style = options.flow_style
         self.count = 0
 
-    def __call__(self, message: Any) -> None:
+    def __call__(self, message: object) -> None:
         """Print one message."""
         self.count += 1
         for name in self._path:
@@ -85,7 +86,7 @@ def echo(options: argparse.Namespace) -> int:
         kind = import_type(type_name, "msg")
         reliable, latched = qos_of_publishers(session, topic)
         profile = choose_qos(options, reliable=reliable, latched=latched)
-        waiting: list[Any] = []
+        waiting: list[object] = []
         session.node.create_subscription(kind, topic, waiting.append, profile, raw=options.raw)
         while True:
             if not session.until(lambda: bool(waiting), options.timeout):

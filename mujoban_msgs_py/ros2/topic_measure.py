@@ -18,6 +18,7 @@ from mujoban_msgs_py.ros2.session import (
     import_type,
     make_qos,
 )
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 WINDOW: Final = 10_000
 """Messages over which hz and delay are taken by default."""
@@ -25,7 +26,7 @@ BANDWIDTH_WINDOW: Final = 100
 """Messages over which the bandwidth is taken by default."""
 
 
-def add_verbs(verbs: Any) -> None:
+def add_verbs(verbs: Verbs) -> None:
     """Add the verbs to the parser."""
     for name, text, window, run in (
         ("hz", "Print the average publishing rate to screen", WINDOW, measure_rate),

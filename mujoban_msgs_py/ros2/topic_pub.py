@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 from mujoban_msgs_py.ros2.messages import fill, parse_values
 from mujoban_msgs_py.ros2.session import (
@@ -15,9 +14,10 @@ from mujoban_msgs_py.ros2.session import (
     full_name,
     import_type,
 )
+from mujoban_msgs_py.ros2.verbs import Verbs
 
 
-def add_verb(verbs: Any) -> None:
+def add_verb(verbs: Verbs) -> None:
     """Add the verb to the parser."""
     parser = verbs.add_parser("pub", help="Publish a message to a topic")
     parser.add_argument("topic_name", help="Name of the topic to publish to (e.g. '/chatter')")

@@ -1,8 +1,22 @@
-"""Descriptors of the nodes' parameters: what `ros2 param describe` prints, and the range that a value must lie in."""
+"""What nodes are made with: options of rclpy, and parameters with what `ros2 param describe` prints of them."""
 
 from __future__ import annotations
 
+from typing import TypedDict, TypeVar, cast
+
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+ValueT = TypeVar("ValueT", bool, int, float, str)
+
+
+class NodeOptions(TypedDict, total=False):
+    """The options of rclpy's `Node` that nodes here are made with."""
+
+    context: Context | None
+    parameter_overrides: list[Parameter]
 
 
 def described(
@@ -24,3 +38,12 @@ def described(
     else:
         descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     return descriptor
+
+
+def declare(node: Node, name: str, default: ValueT, descriptor: ParameterDescriptor) -> ValueT:
+    """Declare a parameter of a node and return its value, which rclpy keeps of the default's type.
+
+    Raises:
+        ParameterException: If it was given a value of another type, or out of its range.
+    """
+    return cast(ValueT, node.declare_parameter(name, default, descriptor).value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar, Unpack, cast
 
 import numpy as np
 from mujoban_msgs.msg import Episode
@@ -14,12 +14,12 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 
-from mujoban_core.interfaces import GroundTruth, module_seeds
+from mujoban_core.interfaces import GroundTruth, Module, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
 from mujoban_core.plugins import LEARNED, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.runtime.descriptors import described
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.kept import KeptArrays, leaves, with_leaves
 from mujoban_msgs_py.runtime.tick_node import Input, Output, TickNode
 from mujoban_msgs_py.topics import Topic
@@ -38,7 +38,10 @@ TRUTH_INPUTS = (
 """What a privileged module receives besides, in the order of `GroundTruth`."""
 
 
-class ModuleNode(TickNode):
+ModuleT = TypeVar("ModuleT", bound=Module)
+
+
+class ModuleNode(TickNode, Generic[ModuleT]):
     """A thin shell around one module: messages in, one step of the module with B = 1, message out.
 
     Parameters:
@@ -61,36 +64,33 @@ class ModuleNode(TickNode):
     output: ClassVar[Topic]
     truth_inputs: ClassVar[Sequence[Input]] = TRUTH_INPUTS
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Load the module and start listening.
 
         Raises:
             ValueError: If the module or its weights cannot be loaded, or `resume_file` is none.
         """
         super().__init__(self.role, **options)
-        threads: Any = self.declare_parameter("threads", 1, described("of PyTorch", fixed=True)).value
-        set_threads(threads)
+        set_threads(declare(self, "threads", 1, described("of PyTorch", fixed=True)))
         which = described("learned, oracle or package.module:Class", fixed=True)
-        source: Any = self.declare_parameter("module", LEARNED, which).value
-        self._source: str = source
-        weights: Any = self.declare_parameter("weights", "", described("weights file; empty: those that ship")).value
-        device: Any = self.declare_parameter("device", "cpu", described("cpu or cuda, such as cuda:0")).value
+        self._source = declare(self, "module", LEARNED, which)
+        weights = declare(self, "weights", "", described("weights file; empty: those that ship"))
+        device = declare(self, "device", "cpu", described("cpu or cuda, such as cuda:0"))
         seeds = described("seed of the module's random streams", fixed=True, low=0, high=2**31 - 1)
-        run_seed: Any = self.declare_parameter("run_seed", 0, seeds).value
-        self._run_seed: int = run_seed
+        self._run_seed = declare(self, "run_seed", 0, seeds)
         self._look_around = 0
         if self.role in LOOKING_ROLES:
             look = described("ticks of a look, a turn on the spot; 0: none", fixed=True, low=0, high=MOST_TICKS)
-            ticks: Any = self.declare_parameter("look_around", 0, look).value
-            self._look_around = ticks
-        self.module: Any = self._load(weights, device)
+            self._look_around = declare(self, "look_around", 0, look)
+        self.module = self._load(weights, device)
         self.state: Any = None
+        """What `step` of the module takes and returns; None before an episode."""
         self._episode = -1
         self.add_on_set_parameters_callback(self._on_parameters)
         self._truth = self.truth_inputs if self.module.privileged else ()
         self._publisher = self.create_output(self.output)
         about = described("file of what the node remembers, to go on from after a crash; empty: none", fixed=True)
-        resume_file: Any = self.declare_parameter("resume_file", "", about).value
+        resume_file = declare(self, "resume_file", "", about)
         self._kept = KeptArrays(Path(resume_file)) if resume_file else None
         if self._kept is not None:
             self._kept.read(self._resume)
@@ -138,16 +138,17 @@ class ModuleNode(TickNode):
         self._episode = number
         self.take_up(stamp, [Output(self._publisher, answer)] if answer else ())
 
-    def _load(self, weights: str, device: str) -> Any:
+    def _load(self, weights: str, device: str) -> ModuleT:
         module = load_module(self.role, self._source, Path(weights) if weights else None, device)
-        return look_around(self.prepare(module), self._look_around, self.scout)
+        # `load_module` has checked that it is of the role.
+        return cast(ModuleT, look_around(self.prepare(module), self._look_around, self.scout))
 
     @property
     def scout(self) -> Scout | None:
         """What says where to look, for a planner that looks around."""
         return None
 
-    def prepare(self, module: Any) -> Any:
+    def prepare(self, module: Module) -> Module:
         """Return the module that was loaded as this node wants it; a ValueError refuses it."""
         return module
 

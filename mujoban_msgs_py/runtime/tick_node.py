@@ -14,7 +14,7 @@ from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import rclpy
 from mujoban_msgs.msg import Episode
@@ -32,9 +32,10 @@ from mujoban_core.signals import StopSignal, interruptible
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import LOG_PERIOD, reject
 from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.synchroniser import Synchroniser
-from mujoban_msgs_py.topics import EPISODE, Topic
+from mujoban_msgs_py.topics import EPISODE, Message, Topic
 
 _DEADLINE = 3600.0
 """Seconds after which a wait begins anew."""
@@ -55,13 +56,14 @@ class Output(NamedTuple):
     """A message to publish."""
 
     publisher: Publisher
-    message: Any
+    message: Message | bytes
+    """Bytes are one that is serialised already."""
 
 
 class TickNode(Node):
     """A node that answers each tick of the simulator."""
 
-    def __init__(self, name: str, **options: Any) -> None:
+    def __init__(self, name: str, **options: Unpack[NodeOptions]) -> None:
         """Make the node; `open_inputs` starts it."""
         super().__init__(name, **options)
         self.counts: Counter[str] = Counter()
