@@ -118,8 +118,8 @@ def run(options: Options | None = None) -> dict[str, Any]:
     solved = int((found.status == Status.SOLVED).sum())
     result |= {
         "levels_solved_optimally_per_second": count / seconds,
-        "solved_share": solved / count,
-        "solved_interval": wilson_interval(solved, count),
+        "success_rate": solved / count,
+        "success_interval": wilson_interval(solved, count),
         "max_nodes": MAX_NODES,
         "nodes_per_level": float(found.nodes.mean()),
     }

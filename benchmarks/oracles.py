@@ -69,7 +69,7 @@ def run(options: Options | None = None) -> dict[str, Any]:
                     unsolved.append(episodes[tick.episode[m]].seed)
                 progress.advance(task)
     return {
-        "episodes": len(solved),
+        "n": len(solved),
         "success_rate": float(np.mean(solved)),
         "success_interval": wilson_interval(sum(solved), len(solved)),
         "mean_return": float(np.mean(returns)),

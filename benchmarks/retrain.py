@@ -65,7 +65,7 @@ def pair_options(folder: Path) -> list[str | Path]:
 
 
 def judge(weights: Path, held_out: Path, options: Options) -> dict[str, Any]:
-    """Return the solve rate in the stack and the rates on held-out bags."""
+    """Return the success rate in the stack and the rates on held-out bags."""
     stack, bags = weights / "stack.json", weights / "bags.json"
     execute(
         "bringup/evaluate.py", "--difficulty", options.difficulty, "--episodes", options.levels,
@@ -76,7 +76,7 @@ def judge(weights: Path, held_out: Path, options: Options) -> dict[str, Any]:
     report, rates = json.loads(stack.read_text()), json.loads(bags.read_text())
     kept = ("box_recall_in_view", "boxes_all_right_if_seen", "wall_accuracy_seen", "termination_recall")
     solved = {key: report[key] for key in ("success_rate", "success_interval")}
-    return {"episodes": options.levels, **solved, **{key: rates[key] for key in kept}}
+    return {"n": options.levels, **solved, **{key: rates[key] for key in kept}}
 
 
 def run(options: Options) -> dict[str, Any]:

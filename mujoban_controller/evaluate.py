@@ -87,7 +87,9 @@ def main(command_line: Sequence[str] | None = None) -> int:
         body=options.body, world=options.world, batch=options.batch, threads=options.threads,
         plans=options.instructions == "plans",
     )  # fmt: skip
-    told = {"weights": identity, "world": options.world, "episodes": options.episodes, "seed": options.seed}
+    told = {
+        "weights": {"controller": identity}, "world": options.world, "n": options.episodes, "seed": options.seed,
+    }  # fmt: skip
     text = json.dumps({**report, **told}, indent=2)
     if options.json is None:
         print(text)

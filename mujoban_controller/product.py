@@ -89,7 +89,7 @@ class ProductLearner(Learner[BatchT]):
             self._best_weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
         kinds = report["instructions"]["kinds"]
         medians = {f"steps/{k}": v["median_steps"] for k, v in kinds.items() if v["median_steps"] is not None}
-        return {"solved": score[0], "feasible": score[1], "steps": report["median_steps"], **medians}
+        return {"success_rate": score[0], "success_rate/feasible": score[1], "steps": report["median_steps"], **medians}
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the best product, or the present one where none was judged."""
@@ -97,6 +97,6 @@ class ProductLearner(Learner[BatchT]):
         chosen = type(product)(**product.config)
         chosen.load_state_dict(self._best_weights or product.state_dict())
         score = self._best_score
-        best = None if score is None else {"solved": score[0], "feasible": score[1]}
+        best = None if score is None else {"success_rate": score[0], "success_rate/feasible": score[1]}
         path = directory.path / f"{product.file_name}.safetensors"
         save_weights(path, chosen, product.config, {**record, "validation": best})

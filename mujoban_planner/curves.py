@@ -43,7 +43,7 @@ def read_curve(run: Path, difficulty: int) -> list[tuple[float, float, float]]:
         OSError: If the run has no metrics.
     """
     lines = (json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines())
-    key = f"evaluation/solve_rate/{difficulty}"
+    key = f"evaluation/success_rate/{difficulty}"
     return [(line["step"], line["cpu_seconds"], line[key]) for line in lines if key in line]
 
 

@@ -100,9 +100,9 @@ def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> d
     decisions = sum(game.decisions for game in games)
     low, high = wilson_interval(int(solved.sum()), len(moves))
     result: dict[str, Any] = {
-        "episodes": len(moves),
-        "solve_rate": float(solved.mean()),
-        "solve_interval": [low, high],
+        "n": len(moves),
+        "success_rate": float(solved.mean()),
+        "success_interval": [low, high],
         "mean_moves": float(moves[solved].mean()) if solved.any() else None,
         "move_limit": MOVE_LIMIT,
         "decisions_per_second": decisions / elapsed,
@@ -113,7 +113,7 @@ def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> d
         "levels": str(options.levels) if options.levels else None,
         "difficulty": None if options.levels else options.difficulty,
         "seed": None if options.levels else options.seed,
-        "weights": {"path": options.weights.name, "digest": digest(options.weights)},
+        "weights": {"planner": digest(options.weights)},
     }
     if isinstance(player, LookAheadPlanner):
         result["expansions"] = options.expansions
@@ -133,8 +133,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
     levels = options.level_batch()
     planner = load(options.weights, options.device)
     result = evaluate(planner, levels, options)
-    low, high = result["solve_interval"]
-    print(f"solve_rate            {result['solve_rate']:.4f}  [{low:.4f}, {high:.4f}]  n = {result['episodes']}")
+    low, high = result["success_interval"]
+    print(f"success rate          {result['success_rate']:.4f}  [{low:.4f}, {high:.4f}]  n = {result['n']}")
     if "moves_over_optimal" in result:
         print(f"moves over optimal    {result['moves_over_optimal']:.3f}")
     print(f"decisions per second  {result['decisions_per_second']:.0f}")

@@ -21,7 +21,7 @@ from mujoban_planner.growth import start_from
 from mujoban_planner.lesson_source import LessonConfig, LessonSource
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch
-from mujoban_planner.validation import NetworkConfig, solve_rates
+from mujoban_planner.validation import NetworkConfig, success_rates
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
@@ -162,7 +162,7 @@ class ImitationLearner(Learner[Batch]):
 
     def evaluate(self) -> dict[str, float]:
         """Return solve rates of the average on held-out levels."""
-        return solve_rates(self.average, reduced_precision=self.device.type == "cpu")
+        return success_rates(self.average, reduced_precision=self.device.type == "cpu")
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the average with its record."""

@@ -24,7 +24,7 @@ from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
 from mujoban_planner.push_policy import PushPolicy, images
 from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
 from mujoban_planner.symmetry import SYMMETRIES
-from mujoban_planner.validation import solve_rates
+from mujoban_planner.validation import success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience
 from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
 from mujoban_rl.limits import NaNGuard
@@ -135,7 +135,7 @@ class PushMPOLearner(Learner[Window]):
 
     def evaluate(self) -> Scalars:
         """Return the averaged planner's solve rates, alone, on held-out levels."""
-        return solve_rates(self.target.planner, reduced_precision=True)
+        return success_rates(self.target.planner, reduced_precision=True)
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the averaged planner's weights with their record."""

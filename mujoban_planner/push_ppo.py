@@ -19,7 +19,7 @@ from torch.distributions import Categorical
 from mujoban_planner.boards import BitBoards
 from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
 from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
-from mujoban_planner.validation import solve_rates
+from mujoban_planner.validation import success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Arrays, Experience
 from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
 from mujoban_rl.limits import NaNGuard
@@ -121,7 +121,7 @@ class PushPPOLearner(Learner[Arrays]):
     def evaluate(self) -> Scalars:
         """Return the planner's solve rates, alone, on held-out levels."""
         planner = self.policy.planner.eval()
-        rates = solve_rates(planner, reduced_precision=True)
+        rates = success_rates(planner, reduced_precision=True)
         planner.train()
         return rates
 

@@ -22,7 +22,7 @@ from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch, StepStore
 from mujoban_planner.moves import MoveActor, PlayConfig
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_planner.validation import NetworkConfig, solve_rates
+from mujoban_planner.validation import NetworkConfig, success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Source, State, Trainer
 from mujoban_rl.run_directory import RunDirectory
@@ -113,7 +113,7 @@ class MPOLearner(DiscreteMPOLearner):
 
     def evaluate(self) -> dict[str, float]:
         """Return solve rates of the target network on held-out levels."""
-        return solve_rates(self.target, reduced_precision=self.device.type == "cpu")
+        return success_rates(self.target, reduced_precision=self.device.type == "cpu")
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the target network with its record."""

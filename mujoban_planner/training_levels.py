@@ -67,14 +67,14 @@ class TrainingLevels:
         self._failed: list[Ticket] = []
 
     @property
-    def solve_rates(self) -> NDArray[np.float64]:
+    def success_rates(self) -> NDArray[np.float64]:
         """Recent solve rate of levels at the first try, by difficulty."""
         return self._solved / np.maximum(self._tried, 1.0)
 
     @property
     def shares(self) -> NDArray[np.float64]:
         """Share of each difficulty among fresh levels."""
-        rates = self.solve_rates
+        rates = self.success_rates
         if rates[-1] > _MASTERED and self._tried[-1] > 50:
             shares = np.zeros(len(rates))
             shares[-2:] = 1.0 - _LATE_SHARE, _LATE_SHARE

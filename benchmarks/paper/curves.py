@@ -40,7 +40,7 @@ class Measure(NamedTuple):
 MEASURES: Final = {
     "controller": (Measure(("instruction/move", "instruction/push"), "instructions completed"),),
     "planner": (
-        Measure(("evaluation/solve_rate/5",), "levels solved"),
+        Measure(("evaluation/success_rate/5",), "levels solved"),
         Measure(("train/accuracy",), "decisions right"),
     ),
     "estimator": (

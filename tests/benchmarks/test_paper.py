@@ -104,7 +104,7 @@ def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
     curves.main(curves.Options(controller=(tmp_path / "first",) * 2, variant="mpo", append=True, out=tmp_path))
     written = [json.loads(line)["step"] for line in (tmp_path / "curve_controller_mpo.jsonl").read_text().splitlines()]
     assert written == [10, 20, 30, 40, 50, 60, 70, 80]
-    with pytest.raises(runs.ResultError, match="fewer than 3 points of evaluation/solve_rate/5"):
+    with pytest.raises(runs.ResultError, match="fewer than 3 points of evaluation/success_rate/5"):
         curves.read_curve("planner", [tmp_path / "first"])
     with pytest.raises(runs.ResultError, match="missing: expected the run directory"):
         curves.read_curve("planner", [tmp_path / "missing"])

@@ -118,7 +118,7 @@ def test_a_planner_whose_decisions_do_not_follow_pushes_is_refused():
 
 def test_curves_are_drawn_against_samples_and_cpu_time(tmp_path):
     trainer = ppo(tmp_path)
-    trainer.learner.evaluate = lambda: {"solve_rate/5": 0.25}
+    trainer.learner.evaluate = lambda: {"success_rate/5": 0.25}
     trainer.run()
     ((samples, cpu_seconds, rate),) = read_curve(tmp_path, 5)
     assert samples == 6 * 16 * 4 and cpu_seconds == trainer.progress.cpu_seconds > 0.0 and rate == 0.25

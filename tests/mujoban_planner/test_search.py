@@ -161,11 +161,11 @@ def test_evaluate_reports_rate_interval_and_optimality(tmp_path, capsys):
     write_levels(path, [generate_level(1, seed) for seed in range(12)])
     assert _run("--levels", path, "--json", out) == 0
     result = json.loads(out.read_text())
-    assert result["episodes"] == 12
-    low, high = result["solve_interval"]
-    assert low <= result["solve_rate"] <= high
+    assert result["n"] == 12
+    low, high = result["success_interval"]
+    assert low <= result["success_rate"] <= high
     assert result["moves_over_optimal"] >= 1.0
-    assert "solve_rate" in capsys.readouterr().out
+    assert "success rate" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

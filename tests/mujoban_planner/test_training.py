@@ -62,7 +62,7 @@ def test_imitation_learns_resumes_and_writes_a_loadable_planner(tmp_path):
     planner = mujoban_planner.load(tmp_path / "planner.safetensors")
     assert planner.config == again.learner.network.config
     record = json.loads((tmp_path / "planner.json").read_text())
-    assert record["samples"] == 128 and "solve_rate/1" in record["metrics"]
+    assert record["samples"] == 128 and "success_rate/1" in record["metrics"]
 
 
 def test_imitation_that_is_terminated_and_resumed_equals_one_that_never_stopped(tmp_path, monkeypatch):
