@@ -64,7 +64,8 @@ class Choice:
         Raises:
             WeightsError: If the weights are missing.
         """
-        from mujoban_rl.weights import WeightsError, digest
+        from mujoban_core.files import digest
+        from mujoban_rl.weights import WeightsError
 
         if self.source in (ORACLE, SCRIPTED) or (self.role == SCOUT and self.source != LEARNED):
             return self.source

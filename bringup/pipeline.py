@@ -7,7 +7,6 @@ every trainer of this project resumes from its directory.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 import subprocess
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mujoban_core import children
-from mujoban_core.files import write_atomically
+from mujoban_core.files import digest, write_atomically
 from mujoban_core.signals import StopSignal
 
 _PERIOD = 0.2
@@ -63,18 +62,6 @@ class Entry:
     inputs: dict[str, str] = field(default_factory=dict)
     """SHA-256 digests of the products of the stages that it needed."""
     outputs: dict[str, str] = field(default_factory=dict)
-
-
-def digest_tree(path: Path) -> str:
-    """Return the SHA-256 of a file, or of the names and contents of all files in a folder."""
-    total = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        if path.is_dir():
-            total.update(file.relative_to(path).as_posix().encode() + b"\0")
-        with file.open("rb") as stream:
-            hashlib.file_digest(stream, lambda: total)
-    return total.hexdigest()
 
 
 class Pipeline:
@@ -188,7 +175,7 @@ class Pipeline:
             if missing := [str(p) for p in stage.products if not p.exists()]:
                 raise PipelineError(f"stage {stage.name} ended without {', '.join(missing)}")
             entry = self.entries[stage.name]
-            entry.outputs = {_name(p, self.directory): digest_tree(p) for p in stage.products}
+            entry.outputs = {_name(p, self.directory): digest(p) for p in stage.products}
             entry.done = True
             self._save()
 

@@ -21,9 +21,9 @@ from mujoban_controller.drivers import Driver
 from mujoban_controller.judge import judge
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
-from mujoban_core.files import check_file, write_atomically
+from mujoban_core.files import check_file, digest, write_atomically
 from mujoban_core.program import read_options, run_command
-from mujoban_rl.weights import digest, load_weights
+from mujoban_rl.weights import load_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range

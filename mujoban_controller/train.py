@@ -33,10 +33,11 @@ from mujoban_controller.play import Draw, ExploringPlayer, Player, PrivilegedPla
 from mujoban_controller.ppo import PPOLearner, PPOTrainingConfig, RolloutSource
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.product import Validation
+from mujoban_core.files import digest
 from mujoban_core.program import read_options, run_command
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import digest, load_weights, provenance
+from mujoban_rl.weights import load_weights, provenance
 from mujoban_sim.oracles import OraclePlanner
 
 PROG = "mujoban_controller.train"

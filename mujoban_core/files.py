@@ -1,7 +1,8 @@
-"""Writing files such that a crash loses nothing."""
+"""Files: written such that a crash loses nothing, and known by their digest."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from collections.abc import Iterator
@@ -46,6 +47,18 @@ def is_device(path: Path) -> bool:
     """Return whether a path is of no file or folder, but of a device or a pipe, as /dev/null and /dev/stdout are."""
     special = path.exists() and not path.is_file() and not path.is_dir()
     return special or any(path.absolute().is_relative_to(folder) for folder in _DEVICES)
+
+
+def digest(path: str | Path) -> str:
+    """Return the SHA-256, in hexadecimal, of a file, or of the names and contents of all files in a folder."""
+    path = Path(path)
+    total = hashlib.sha256()
+    for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
+        if file != path:
+            total.update(file.relative_to(path).as_posix().encode() + b"\0")
+        with file.open("rb") as stream:
+            hashlib.file_digest(stream, lambda: total)
+    return total.hexdigest()
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mujoban_core.files import check_file, write_atomically
+from mujoban_core.files import check_file, digest, write_atomically
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.program import read_options, run_command
 from mujoban_core.stats import wilson_interval
@@ -22,7 +22,6 @@ from mujoban_planner.boards import take_levels
 from mujoban_planner.lookahead import LookAheadPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
-from mujoban_rl.weights import digest
 from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_batch, seed_range
 from mujoban_sokoban.levels import LevelBatch, read_levels, stack_levels
 from mujoban_sokoban.solver import Status, solve_batch

@@ -18,14 +18,14 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from mujoban_core.files import write_atomically
+from mujoban_core.files import digest, write_atomically
 from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.program import read_options, run_command
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.compiled import DIGEST, INPUTS, OUTPUTS, graph_path
 from mujoban_planner.heads import INSTRUCTIONS, INTERIOR, Weighed
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_rl.weights import digest, read_record, record_path
+from mujoban_rl.weights import read_record, record_path
 
 PROG = "mujoban_planner.export"
 

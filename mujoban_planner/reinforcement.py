@@ -17,6 +17,7 @@ from typing import Any, Final
 import torch
 from torch import nn
 
+from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch, StepStore
@@ -26,7 +27,7 @@ from mujoban_planner.validation import NetworkConfig, success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Source, State, Trainer
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import digest, provenance, save_weights
+from mujoban_rl.weights import provenance, save_weights
 
 _PLAYED: Final = "abstract environment on generated levels, training seeds"
 

@@ -170,7 +170,7 @@ class Trainer(Generic[BatchT]):
             record: What the weights' record says beside progress and metrics (see `mujoban_rl.weights.provenance`).
 
         Raises:
-            RunError: If there are checkpoints but none is intact.
+            RunError: If there are checkpoints but none is intact, or they are of another kind of run.
         """
         self.directory, self.learner, self.source = directory, learner, source
         self.budget, self.cadence = budget, cadence or Cadence()
@@ -181,6 +181,7 @@ class Trainer(Generic[BatchT]):
         self._guard = NaNGuard()
         self._published: dict[str, Tensor] | None = None
         self._version = 0
+        self._evaluated: int | None = None
         self._restore()
 
     @property
@@ -215,7 +216,7 @@ class Trainer(Generic[BatchT]):
                 StopSignal() as stop,
             ):
                 spent = self._loop(log, stop, limits)
-                if not stop.requested:
+                if not stop.requested and self._evaluated != self.progress.updates:
                     self._evaluate(log)
                 self.save()
         finally:
@@ -262,6 +263,7 @@ class Trainer(Generic[BatchT]):
         self.source.publish(self._published, self._version)
 
     def _evaluate(self, log: TrainingLog) -> None:
+        self._evaluated = self.progress.updates
         # A rate of nothing is not a number, which JSON does not know.
         self.metrics = {k: float(v) for k, v in self.learner.evaluate().items() if math.isfinite(v)}
         if not self.metrics:
@@ -307,14 +309,15 @@ class Trainer(Generic[BatchT]):
         )
         if snapshot is None:
             return
-        self.progress = Progress(**snapshot.extra["progress"])
-        self.metrics = snapshot.extra["metrics"]
-        self._guard.skipped = snapshot.extra["skipped"]
-        state = State(snapshot.extra, snapshot.tensors)
-        for name, part in parts.items():
-            part.restore(state.part(name))
-        published = state.part("published")
-        self._published, self._version = published.tensors, published.values["version"]
+        with self.directory.reading(snapshot.step):
+            self.progress = Progress(**snapshot.extra["progress"])
+            self.metrics = snapshot.extra["metrics"]
+            self._guard.skipped = snapshot.extra["skipped"]
+            state = State(snapshot.extra, snapshot.tensors)
+            for name, part in parts.items():
+                part.restore(state.part(name))
+            published = state.part("published")
+            self._published, self._version = published.tensors, published.values["version"]
         self.source.samples = self.progress.samples
 
 

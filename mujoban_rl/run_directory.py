@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from mujoban_core.files import replacing, write_atomically
-from mujoban_rl.weights import check_finite, digest
+from mujoban_core.files import digest, replacing, write_atomically
+from mujoban_rl.weights import check_finite
+
+_ANOTHER = "choose another directory"
 
 
 class RunError(ValueError):
@@ -48,7 +51,7 @@ class RunDirectory:
             keep: Number of checkpoints kept.
 
         Raises:
-            RunError: If the directory belongs to a run with another configuration.
+            RunError: If the directory belongs to a run with another configuration, or to none.
         """
         self.path = Path(path)
         self.keep = keep
@@ -57,11 +60,13 @@ class RunDirectory:
         self.path.mkdir(parents=True, exist_ok=True)
         file = self.path / "config.json"
         if file.exists():
-            stored = json.loads(file.read_text())
+            stored = _read_config(file)
             changed = sorted(k for k in stored.keys() | self.config.keys() if stored.get(k) != self.config.get(k))
             if changed:
                 pairs = ", ".join(f"{k}: {stored.get(k)!r} there, {self.config.get(k)!r} now" for k in changed)
-                raise RunError(f"{self.path}: a run with another configuration ({pairs}); choose another directory")
+                raise RunError(f"{self.path}: a run with another configuration ({pairs}); {_ANOTHER}")
+        elif self._checkpoints():
+            raise RunError(f"{self.path}: has checkpoints but no {file.name}, expected both or neither; {_ANOTHER}")
         else:
             write_atomically(file, (json.dumps(self.config, indent=2) + "\n").encode())
 
@@ -121,7 +126,7 @@ class RunDirectory:
         """Restore the newest intact checkpoint in place; return None when there is no checkpoint.
 
         Raises:
-            RunError: If there are checkpoints but none is intact.
+            RunError: If there are checkpoints but none is intact, or they are of another kind of run.
         """
         candidates = self._checkpoints()
         for path in candidates:
@@ -129,19 +134,47 @@ class RunDirectory:
             if loaded is None:
                 continue
             content, flat = loaded
-            for name, module in modules.items():
-                module.load_state_dict(_below(flat, f"module/{name}/"))
-            for name, optimiser in (optimisers or {}).items():
-                state = _join_optimiser(_below(flat, f"optimiser/{name}/"), content["optimisers"][name])
-                optimiser.load_state_dict(state)
-                _lay_out(optimiser)
-            return Snapshot(content["step"], content["extra"], _below(flat, "tensor/"))
+            with self.reading(content.get("step")):
+                for name, module in modules.items():
+                    module.load_state_dict(_below(flat, f"module/{name}/"))
+                for name, optimiser in (optimisers or {}).items():
+                    state = _join_optimiser(_below(flat, f"optimiser/{name}/"), content["optimisers"][name])
+                    optimiser.load_state_dict(state)
+                    _lay_out(optimiser)
+                return Snapshot(content["step"], content["extra"], _below(flat, "tensor/"))
         if candidates:
             raise RunError(f"{self.path}: none of {len(candidates)} checkpoints is intact")
         return None
 
+    @contextmanager
+    def reading(self, step: int | None) -> Iterator[None]:
+        """Say of what fails inside that the checkpoint of a step is not of this kind of run.
+
+        Raises:
+            RunError: If it lacks an entry, or an entry does not fit.
+        """
+        try:
+            yield
+        except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            what = f"no entry {error}" if isinstance(error, KeyError) else " ".join(str(error).split())[:200]
+            raise RunError(
+                f"{self.path}: its checkpoint at step {step} is of another version or kind of run ({what}), "
+                f"expected one that this trainer wrote; {_ANOTHER}"
+            ) from error
+
     def _checkpoints(self) -> list[Path]:
         return sorted(self.path.glob("checkpoint-*.safetensors"), reverse=True)
+
+
+def _read_config(file: Path) -> dict[str, Any]:
+    """Return the configuration that a run was begun with."""
+    try:
+        stored = json.loads(file.read_text())
+    except ValueError:
+        stored = None
+    if not isinstance(stored, dict):
+        raise RunError(f"{file}: no JSON object, expected the configuration of a run; {_ANOTHER}")
+    return stored
 
 
 def _read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | None:

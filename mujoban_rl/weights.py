@@ -36,12 +36,6 @@ class WeightsError(ValueError):
     """A weights file or its record is missing, damaged, or does not fit the module."""
 
 
-def digest(path: str | Path) -> str:
-    """Return the SHA-256 of a file in hexadecimal."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def record_path(path: str | Path) -> Path:
     """Return where the record of a weights file stands."""
     return Path(path).with_suffix(".json")

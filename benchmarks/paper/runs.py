@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import tyro
 
+from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
-from mujoban_rl.weights import digest
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 RESULTS: Final = ROOT / "docs" / "results"

@@ -12,6 +12,7 @@ from mcap.exceptions import McapError
 from mcap.records import Chunk, Metadata
 from mcap.stream_reader import StreamReader
 
+from mujoban_core.files import digest
 from mujoban_msgs_py.bags.errors import BagError
 
 IDENTITY: Final = "mujoban_bag"
@@ -73,8 +74,7 @@ def file_digest(path: Path) -> str:
 @lru_cache(maxsize=1024)
 def _digest(path: Path, size: int, changed: int, inode: int) -> str:
     del size, changed, inode
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    return digest(path)
 
 
 def require_regular(path: Path) -> None:

@@ -8,8 +8,8 @@ from benchmarks.paper import __main__ as results
 from benchmarks.paper import curves, film, parts, runs, tables
 from bringup.command import Choice, Stack
 from bringup.results import EpisodeResult, report, write_report
+from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
-from mujoban_rl.weights import digest
 
 ORACLES = Stack({role: Choice(role, "oracle") for role in ROLES})
 EASY = runs.Run("easy", "easy", difficulty=1, oracle=tuple(ROLES))

@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from bringup.pipeline import Pipeline, PipelineError, Stage, digest_tree
+from bringup.pipeline import Pipeline, PipelineError, Stage
+from mujoban_core.files import digest
 from mujoban_core.signals import Interrupted
 
 COPY = "import sys, pathlib; pathlib.Path(sys.argv[2]).write_text(pathlib.Path(sys.argv[1]).read_text() + 'b')"
@@ -45,7 +46,7 @@ def test_stages_run_in_the_order_of_their_needs_and_only_once(tmp_path):
 def test_the_record_holds_the_digests_of_what_each_stage_came_from(tmp_path):
     Pipeline(tmp_path, stages(tmp_path)).run()
     record = json.loads((tmp_path / "pipeline.json").read_text())
-    assert record["second"]["inputs"] == {"a.txt": digest_tree(tmp_path / "a.txt")} == record["first"]["outputs"]
+    assert record["second"]["inputs"] == {"a.txt": digest(tmp_path / "a.txt")} == record["first"]["outputs"]
 
 
 def test_a_stopped_run_ends_its_commands_and_goes_on_where_it_was(tmp_path):

@@ -95,6 +95,22 @@ def test_run_directory_refuses_another_configuration(tmp_path):
         RunDirectory(tmp_path, {"lr": 2})
 
 
+def test_a_directory_of_another_kind_of_run_is_refused_by_name(tmp_path):
+    old = RunDirectory(tmp_path / "old", {})
+    old.save(3, modules={"learner.net": nn.Linear(2, 2)}, extra={"seconds": 1.0})
+    with pytest.raises(RunError, match=r"old: its checkpoint at step 3 .*no entry 'adam'.*expected"):
+        optimiser = torch.optim.Adam(nn.Linear(2, 2).parameters())
+        old.load(modules={"learner.net": nn.Linear(2, 2)}, optimisers={"adam": optimiser})
+    with pytest.raises(RunError, match=r"old: its checkpoint at step 3 .*expected"):
+        old.load(modules={"learner.net": nn.Linear(3, 2)})
+    (tmp_path / "old" / "config.json").write_text("[1]")
+    with pytest.raises(RunError, match=r"config\.json: no JSON object, expected"):
+        RunDirectory(tmp_path / "old", {})
+    (tmp_path / "old" / "config.json").unlink()
+    with pytest.raises(RunError, match=r"old: has checkpoints but no config\.json, expected"):
+        RunDirectory(tmp_path / "old", {})
+
+
 def test_weights_round_trip_and_name_what_is_wrong(tmp_path):
     net, _ = _make()
     path = tmp_path / "net.safetensors"
