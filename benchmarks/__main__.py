@@ -2,34 +2,43 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
-import json
 import os
 import platform
-import sys
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
 
-DEFAULT = ("world", "rendering", "graph", "levels", "actors")
+import tyro
+
+from benchmarks.command import run_benchmark
+
+DEFAULT: Final = ("world", "rendering", "graph", "levels", "actors")
 """Benchmarks of speed; each has a `run` that returns a mapping."""
 
 
-def main() -> int:
-    """Run the benchmarks and print one JSON object."""
-    parser = argparse.ArgumentParser(prog="benchmarks", description=__doc__)
-    parser.add_argument("names", nargs="*", default=list(DEFAULT), metavar="NAME", help=f"some of {', '.join(DEFAULT)}")
-    names = parser.parse_args().names
-    unknown = sorted(set(names) - set(DEFAULT))
-    if unknown:
-        parser.error(f"unknown benchmark {unknown[0]!r}: expected some of {', '.join(DEFAULT)}")
+@dataclass(frozen=True)
+class Options:
+    """Measure."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = DEFAULT
+    """What is measured."""
+
+    def __post_init__(self) -> None:
+        """Reject benchmarks that there are not."""
+        unknown = [name for name in self.names if name not in DEFAULT]
+        if unknown:
+            raise ValueError(f"{unknown[0]}: expected some of {', '.join(DEFAULT)}")
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Return the reports of the benchmarks by name."""
     # The comparison with MuJoCo's own renderer needs a backend that works without a display.
     os.environ.setdefault("MUJOCO_GL", "egl")
-    report = {
+    return {
         "machine": {"cores": os.cpu_count(), "load": os.getloadavg()[0], "python": platform.python_version()},
-        **{name: importlib.import_module(f"benchmarks.{name}").run() for name in names},
+        **{name: importlib.import_module(f"benchmarks.{name}").run() for name in options.names},
     }
-    print(json.dumps(report, indent=2))
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_benchmark("benchmarks", Options, measure, __doc__)

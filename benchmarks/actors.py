@@ -10,7 +10,6 @@ counts. ``python -m benchmarks.actors`` prints JSON, with what `docs/cluster.md`
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 import time
@@ -19,9 +18,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
+from benchmarks.command import run_benchmark
 from benchmarks.plan import Measured, plan
 from mujoban_controller.controller import VisuomotorController
 from mujoban_core.interfaces import ControllerInput
@@ -191,5 +190,4 @@ class Options:
 
 
 if __name__ == "__main__":
-    options = tyro.cli(Options)
-    print(json.dumps(run(options.seconds, options.rounds), indent=2))
+    run_benchmark("benchmarks.actors", Options, lambda chosen: run(chosen.seconds, chosen.rounds))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ import tyro
 from numpy.typing import NDArray
 
 from mujoban_core.grid import CELL_SIZE, cell_to_xy, xy_to_cell
+from mujoban_core.program import read_options, run_command
 from mujoban_sim.presets import REFERENCE
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
@@ -36,6 +36,9 @@ _REST: Final = 0.02
 """Metres and metres per second below which a box counts as unmoved."""
 _LAST: Final = 5
 """Control steps over which the speed at the end is taken."""
+
+
+PROG: Final = "benchmarks.conformance"
 
 
 @dataclass(frozen=True)
@@ -213,20 +216,16 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    try:
-        options = tyro.cli(Options, args=args, description=__doc__)
-        runs = read_runs(options.folder)
-        if not runs:
-            raise ValueError(f"{options.folder}/runs.json has no run: expected at least one")
-        report = {"world": options.world, **compare(runs, play(runs, options.world))}
-    except (ValueError, OSError) as error:
-        print(f"benchmarks.conformance: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    options = read_options(Options, command_line, PROG, __doc__)
+    runs = read_runs(options.folder)
+    if not runs:
+        raise ValueError(f"{options.folder}/runs.json has no run: expected at least one")
+    report = {"world": options.world, **compare(runs, play(runs, options.world))}
     print(json.dumps(report, indent=2) if options.json else table(report))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(PROG, main)

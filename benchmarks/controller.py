@@ -9,7 +9,6 @@ Step times are processor time of one thread, so that other work on the machine h
 
 from __future__ import annotations
 
-import json
 import time
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -20,12 +19,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor, nn
 
+from benchmarks.command import run_benchmark
 from benchmarks.timing import milliseconds
 from mujoban_controller import train
 from mujoban_controller.controller import VisuomotorController
@@ -257,9 +256,8 @@ def run() -> dict[str, object]:
     return {"controller_step_ms": step_time(200), **training_rates(4)}
 
 
-def main() -> None:
-    """Measure and print."""
-    options = tyro.cli(Options)
+def measure(options: Options) -> dict[str, object]:
+    """Return the quick measurements, and those that were asked for."""
     torch.set_num_threads(1)
     result: dict[str, object] = {"controller_step_ms": step_time(options.repeats), **training_rates(options.rounds)}
     if options.pendulum_steps:
@@ -269,8 +267,8 @@ def main() -> None:
         result |= {"pendulum_curve": curve, "pendulum_return": float(np.mean(final))}
     if options.random_steps:
         result |= RandomDrive(options.seed).play(options.random_steps)
-    print(json.dumps(result, indent=2))
+    return result
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark("benchmarks.controller", Options, measure)

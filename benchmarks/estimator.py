@@ -6,15 +6,14 @@ are read from them. Times are processor time of one thread, so that other work o
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 
+from benchmarks.command import run_benchmark
 from benchmarks.timing import milliseconds
 from mujoban_core.bodies import BALL
 from mujoban_core.interfaces import EstimatorInput, TerminationInput
@@ -82,15 +81,14 @@ def reading_rate(bags: tuple[Path, ...]) -> float:
     return report.ticks / (time.process_time() - start)
 
 
-def main() -> None:
-    """Run the benchmark."""
-    options = tyro.cli(Options, description=__doc__)
+def measure(options: Options) -> dict[str, float]:
+    """Return times of steps and rates of training and reading."""
     torch.set_num_threads(1)
     result = {**step_times(options.repeats), "training_ticks_per_s": training_rate(options.training_steps)}
     if options.bags:
         result["bag_frames_per_s"] = reading_rate(options.bags)
-    print(json.dumps({name: round(value, 3) for name, value in result.items()}, indent=2))
+    return {name: round(value, 3) for name, value in result.items()}
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark("benchmarks.estimator", Options, measure, __doc__)

@@ -8,7 +8,6 @@ it held before.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -25,11 +24,11 @@ from typing import Any, Literal
 
 import numpy as np
 import rclpy
-import tyro
 from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import SetBool, Trigger
 
 import mujoban_planner
+from benchmarks.command import run_benchmark
 from benchmarks.malformed import Vandal
 from bringup.run_stack import main as play
 from mujoban_msgs_py.bags import open_bag
@@ -174,8 +173,13 @@ def files(options: Options) -> dict[str, dict[str, int]]:
         }  # fmt: skip
 
 
+def measure(options: Options) -> dict[str, Any]:
+    """Return what became of damaged files and of a graph under attack."""
+    return {
+        "options": asdict(options), "files": files(options),
+        "runs": [attack(mode, options) for mode in options.modes],
+    }  # fmt: skip
+
+
 if __name__ == "__main__":
-    chosen = tyro.cli(Options)
-    report = {"options": asdict(chosen), "files": files(chosen), "runs": []}
-    report["runs"] = [attack(mode, chosen) for mode in chosen.modes]
-    print(json.dumps(report, indent=2))
+    run_benchmark("benchmarks.fuzz", Options, measure)

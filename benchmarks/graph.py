@@ -6,14 +6,13 @@ median over the rounds. ``python -m benchmarks.graph`` prints it as JSON.
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from dataclasses import asdict, dataclass
 
 import torch
-import tyro
 
+from benchmarks.command import run_benchmark
 from bringup.command import Choice, Stack
 from bringup.rollout import rollout
 from bringup.stack import PlayOptions, play
@@ -69,5 +68,4 @@ def run(options: Options | None = None) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    chosen_options = tyro.cli(Options)
-    print(json.dumps({"options": asdict(chosen_options), **run(chosen_options)}, indent=2))
+    run_benchmark("benchmarks.graph", Options, lambda chosen: {"options": asdict(chosen), **run(chosen)})

@@ -8,7 +8,6 @@ memory, a bag that can be read. After SIGKILL only the processes are looked for:
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import pty
 import select
@@ -26,8 +25,8 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
-import tyro
 
+from benchmarks.command import run_benchmark
 from mujoban_core import children
 from mujoban_core.signals import interruptible
 from mujoban_msgs_py.bags import BagError, open_bag
@@ -305,5 +304,4 @@ def run(options: Options | None = None) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    chosen_options = tyro.cli(Options)
-    print(json.dumps({"options": asdict(chosen_options), **run(chosen_options)}, indent=2))
+    run_benchmark("benchmarks.interrupts", Options, lambda chosen: {"options": asdict(chosen), **run(chosen)})

@@ -7,7 +7,6 @@ twice or ended otherwise than in a run that nobody disturbed.
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 import time
@@ -17,8 +16,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import rclpy
-import tyro
 
+from benchmarks.command import run_benchmark
 from bringup.command import Choice, Stack
 from bringup.domain import claim_domain
 from bringup.graph import NODES, RESPAWN_PERIOD, InProcess, Processes
@@ -162,8 +161,11 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def measure(options: Options) -> dict[str, Any] | str:
+    """Return the outcome, as a table unless JSON is asked for."""
+    outcome = run(options)
+    return {"options": asdict(options), **outcome} if options.json else table(outcome)
+
+
 if __name__ == "__main__":
-    chosen_options = tyro.cli(Options)
-    outcome = run(chosen_options)
-    everything = {"options": asdict(chosen_options), **outcome}
-    print(json.dumps(everything, indent=2) if chosen_options.json else table(outcome))
+    run_benchmark("benchmarks.kills", Options, measure)

@@ -7,16 +7,15 @@ compilation, so that other work on the machine hardly changes them.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
+from benchmarks.command import run_benchmark
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.stats import wilson_interval
 from mujoban_sokoban.generator import generate_batch, generate_levels
@@ -147,5 +146,7 @@ def _states(batch: LevelBatch, shown: Any, rng: np.random.Generator) -> LevelBat
 
 
 if __name__ == "__main__":
-    chosen = tyro.cli(Options, description=__doc__)
-    print(json.dumps(statistics(chosen.statistics) if chosen.statistics else run(chosen), indent=2))
+    run_benchmark(
+        "benchmarks.levels", Options,
+        lambda chosen: statistics(chosen.statistics) if chosen.statistics else run(chosen), __doc__,
+    )  # fmt: skip

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import tyro
-
 from benchmarks.paper.runs import ALL, ROOT, load
 from mujoban_core.files import write_atomically
+from mujoban_core.program import read_options, run_command
 
 CARDS: Final = ROOT / "docs" / "models"
 _WIDTH: Final = 112
@@ -201,6 +199,9 @@ def stale() -> list[Path]:
     )
 
 
+PROG: Final = "benchmarks.model_cards"
+
+
 @dataclass(frozen=True)
 class Options:
     """What to do."""
@@ -209,24 +210,20 @@ class Options:
     """Only say which cards are not up to date, with status 1 if there are any."""
 
 
-def main() -> int:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    options = tyro.cli(Options, description=__doc__)
-    try:
-        old = stale()
-        if not options.check:
-            CARDS.mkdir(parents=True, exist_ok=True)
-            for file in old:
-                file.unlink(missing_ok=True)
-            for path in records():
-                write_atomically(CARDS / f"{path.stem}.md", card(path).encode())
-    except CardError as error:
-        print(f"benchmarks.model_cards: error: {error}", file=sys.stderr)
-        return 2
+    options = read_options(Options, command_line, PROG, __doc__)
+    old = stale()
+    if not options.check:
+        CARDS.mkdir(parents=True, exist_ok=True)
+        for file in old:
+            file.unlink(missing_ok=True)
+        for path in records():
+            write_atomically(CARDS / f"{path.stem}.md", card(path).encode())
     for file in old:
         print(f"{file.relative_to(ROOT)} {'is not up to date' if options.check else 'renewed'}")
     return int(options.check and bool(old))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(PROG, main)

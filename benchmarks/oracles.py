@@ -6,16 +6,15 @@ instructions per episode, instructions that ran into their limit, and the steps 
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.progress import Progress
 
+from benchmarks.command import run_benchmark
 from bringup.rollout import ticks
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.stats import wilson_interval
@@ -87,4 +86,4 @@ def run(options: Options | None = None) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(tyro.cli(Options, description=__doc__)), indent=2))
+    run_benchmark("benchmarks.oracles", Options, run, __doc__)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import tyro
+
+from benchmarks.command import run_benchmark
 
 
 @dataclass(frozen=True)
@@ -77,11 +78,14 @@ class Options:
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 
 
-if __name__ == "__main__":
-    options = tyro.cli(Options)
-    report = {
+def report(options: Options) -> dict[str, object]:
+    """Return the plan with what it rests on."""
+    return {
         "measured": asdict(options.measured),
         "settings": asdict(options.settings),
         "plan": plan(options.measured, options.actors, options.settings),
     }
-    print(json.dumps(report, indent=2))
+
+
+if __name__ == "__main__":
+    run_benchmark("benchmarks.plan", Options, report)

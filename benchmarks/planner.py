@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
 
+from benchmarks.command import run_benchmark
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.boards import BitBoards, abstract_states, bit_boards, state_tensor
@@ -140,12 +138,11 @@ def demonstrations_per_second(options: Options) -> float:
     return 64 * rate(step, options.seconds)
 
 
-def main() -> None:
-    """Print the figures as JSON."""
-    options = tyro.cli(Options)
+def measure(options: Options) -> dict[str, Any]:
+    """Return the figures."""
     torch.set_num_threads(options.threads)
     shipped = load(SHIPPED)
-    result: dict[str, Any] = {
+    return {
         "decision": {
             f"shipped ({type(shipped).__name__})": decision_milliseconds(shipped, options.seconds),
             "RecurrentPlanner": decision_milliseconds(exported(RecurrentPlanner()), options.seconds),
@@ -165,8 +162,6 @@ def main() -> None:
         "threads": options.threads,
         "torch": torch.__version__,
     }
-    json.dump(result, sys.stdout, indent=2)
-    print()
 
 
 def _wait(device: str) -> None:
@@ -175,4 +170,4 @@ def _wait(device: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_benchmark("benchmarks.planner", Options, measure)

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
+from benchmarks.command import run_benchmark
 from mujoban_core.plugins import ROLES
 from mujoban_sokoban.generator import VALIDATION_SEEDS
 
@@ -112,4 +111,4 @@ def run(options: Options) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(tyro.cli(Options, description=__doc__)), indent=2))
+    run_benchmark("benchmarks.retrain", Options, run, __doc__)

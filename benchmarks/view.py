@@ -8,7 +8,6 @@ core is free for the viewer, the rate falls as much as this time grows. ``python
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 import urllib.request
@@ -17,8 +16,8 @@ from dataclasses import asdict
 from urllib.error import URLError
 
 import torch
-import tyro
 
+from benchmarks.command import run_benchmark
 from benchmarks.graph import Options
 from bringup.command import Stack
 from bringup.domain import claim_domain
@@ -88,5 +87,4 @@ def run(options: Options | None = None) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    chosen_options = tyro.cli(Options)
-    print(json.dumps({"options": asdict(chosen_options), **run(chosen_options)}, indent=2))
+    run_benchmark("benchmarks.view", Options, lambda chosen: {"options": asdict(chosen), **run(chosen)})

@@ -7,7 +7,6 @@ test of stability.
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 import time
@@ -17,9 +16,9 @@ from dataclasses import asdict, dataclass
 import gymnasium
 import mujoco
 import numpy as np
-import tyro
 
 import mujoban_sim  # noqa: F401 - registers the environment
+from benchmarks.command import run_benchmark
 from mujoban_core.grid import xy_to_cell
 from mujoban_sim.scene import SceneCache
 from mujoban_sim.world import World
@@ -159,5 +158,4 @@ def run(options: Options | None = None) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    chosen = tyro.cli(Options, description=__doc__)
-    print(json.dumps({**run(chosen), "options": asdict(chosen)}, indent=2))
+    run_benchmark("benchmarks.world", Options, lambda chosen: {"options": asdict(chosen), **run(chosen)}, __doc__)

@@ -29,7 +29,7 @@ _TAIL = 2000
 """Characters of a failed command's log that the error shows."""
 
 
-class PipelineError(RuntimeError):
+class PipelineError(ValueError):
     """A stage failed, or the stages cannot be run in any order."""
 
 

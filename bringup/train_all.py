@@ -8,19 +8,17 @@ command goes on. At the end stand `weights/` and `report.md` in the run's direct
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from bringup.pipeline import Pipeline, PipelineError, Stage
+from bringup.pipeline import Pipeline, Stage
 from bringup.training_report import write_report
-from mujoban_core.signals import interrupt_status
+from mujoban_core.program import read_options, run_command
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import TRAIN_SEEDS, VALIDATION_SEEDS
 
@@ -228,18 +226,11 @@ def train_all(options: Options) -> Path:
     return write_report(options.run, pipeline, WEIGHTS)
 
 
-def main() -> int:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
-    try:
-        options = tyro.cli(Annotated[Options, tyro.conf.arg(name="")], prog=PROG, description=__doc__)
-        print(train_all(options))
-    except KeyboardInterrupt as error:
-        return interrupt_status(error)
-    except (ValueError, OSError, PipelineError) as error:
-        print(f"{PROG}: error: {error}", file=sys.stderr)
-        return 2
+    print(train_all(read_options(Options, command_line, PROG, __doc__)))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(PROG, main)

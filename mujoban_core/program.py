@@ -13,7 +13,9 @@ A program's options are a dataclass; its `main` reads them and is run by `run_co
 from __future__ import annotations
 
 import io
+import os
 import re
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, suppress
@@ -25,6 +27,8 @@ from mujoban_core.signals import interrupt_status, interruptible, interruption, 
 
 OptionsT = TypeVar("OptionsT")
 
+_READER_LEFT: Final = 128 + signal.SIGPIPE
+"""Exit status of a command whose output nobody reads on, as that of `head` and its like: as if SIGPIPE had ended it."""
 USAGE_ERROR: Final = 2
 """Exit status of a command whose input was bad."""
 _SCRIPTS: Final = "mujoban-"
@@ -45,15 +49,20 @@ def called(prog: str) -> str:
 def exit_status(prog: str, command: Callable[[], int]) -> int:
     """Run a command and return its exit status.
 
-    Bad input is one line on stderr and status 2; a signal that asks the command to end is status 130 or 143.
+    Bad input is one line on stderr and status 2; a signal that asks the command to end is status 130 or 143. Where
+    nobody reads the output on, as behind `| head`, the command ends without a word.
     """
     end_with_parent()
     try:
         with interruptible():
-            return command()
+            return _flushed(command)
     except (ValueError, OSError) as error:
         if (earlier := interruption(error)) is not None:
             return interrupt_status(earlier)
+        if isinstance(error, BrokenPipeError):
+            # Python flushes once more when it ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return _READER_LEFT
         say(f"{prog}: error: {reason(error)}")
         return USAGE_ERROR
     except KeyboardInterrupt as error:
@@ -61,6 +70,14 @@ def exit_status(prog: str, command: Callable[[], int]) -> int:
         return interrupt_status(error)
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
+
+
+def _flushed(command: Callable[[], int]) -> int:
+    """Run a command; what it has printed fails here, if it does, and not when the process ends."""
+    try:
+        return command()
+    finally:
+        sys.stdout.flush()
 
 
 def reason(error: Exception) -> str:

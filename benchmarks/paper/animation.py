@@ -5,17 +5,19 @@ Plays the recorded episode of Figure 3 again and draws what the robot sees besid
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 import tyro
 from PIL import Image
 
 from benchmarks.paper import film
-from mujoban_sim.rendering import RenderingError
+from mujoban_core.program import read_options, run_command
+
+PROG: Final = "benchmarks.paper.animation"
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Options:
     colours: int = 64
 
 
-def main(options: Options) -> None:
+def draw(options: Options) -> None:
     """Write the animation.
 
     Raises:
@@ -55,8 +57,11 @@ def main(options: Options) -> None:
     print(f"{options.path}: {options.path.stat().st_size / 1e3:.0f} kB")
 
 
+def main(command_line: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    draw(read_options(Options, command_line, PROG, __doc__))
+    return 0
+
+
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, prog="benchmarks.paper.animation"))
-    except (ValueError, OSError, RenderingError) as failure:
-        sys.exit(f"animation: error: {' '.join(str(failure).split())}")
+    run_command(PROG, main)

@@ -10,17 +10,16 @@ goes on after the points that the file has. `--variant mpo` writes `curve_<modul
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import tyro
 
 from benchmarks.paper.runs import JSON, ResultError
 from mujoban_core.files import write_atomically
+from mujoban_core.program import read_options, run_command
 
 MODULES: Final = ("controller", "planner", "estimator", "termination")
 _FEWEST: Final = 3
@@ -53,6 +52,9 @@ MEASURES: Final = {
     ),
 }
 """What is drawn of each module: success or accuracy as in the paper, and the next one where a run has too few of it."""
+
+
+PROG: Final = "benchmarks.paper.curves"
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def _thin(points: Sequence[tuple[float, float, float]]) -> list[tuple[float, flo
     return [(float(part[-1, 0]), round(float(np.average(part[:, 1], weights=part[:, 2])), 5)) for part in stretches]
 
 
-def main(options: Options) -> None:
+def write(options: Options) -> None:
     """Write the curves of the modules whose runs are named."""
     for module in MODULES:
         runs: tuple[Path, ...] = getattr(options, module)
@@ -120,8 +122,11 @@ def main(options: Options) -> None:
         print(f"{file.name}: {len(points)} points of {points[0]['what']!r}")
 
 
+def main(command_line: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    write(read_options(Options, command_line, PROG, __doc__))
+    return 0
+
+
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, prog="benchmarks.paper.curves"))
-    except (ValueError, OSError) as failure:
-        sys.exit(f"curves: error: {' '.join(str(failure).split())}")
+    run_command(PROG, main)

@@ -8,15 +8,14 @@ Rebuilding tables and figures from the JSON takes seconds: `make results`.
 from __future__ import annotations
 
 import json
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import tyro
-
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
+from mujoban_core.program import read_options, run_command
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 RESULTS: Final = ROOT / "docs" / "results"
@@ -123,6 +122,9 @@ def is_current(run: Run, episodes: int) -> bool:
     return report is not None and len(report["episodes"]) == episodes and not is_stale(report)
 
 
+PROG: Final = "benchmarks.paper.runs"
+
+
 @dataclass(frozen=True)
 class Options:
     """Rerun the evaluations behind tables and figures."""
@@ -139,7 +141,7 @@ class Options:
     """Rerun also what has been measured with the weights that ship now."""
 
 
-def main(options: Options) -> None:
+def rerun(options: Options) -> None:
     """Rerun the evaluations."""
     # Imported here: both need the definitions above.
     from benchmarks.paper import film, parts
@@ -147,7 +149,7 @@ def main(options: Options) -> None:
     names = [*(run.name for run in ALL), film.NAME]
     unknown = set(options.only) - set(names)
     if unknown:
-        sys.exit(f"unknown evaluation {', '.join(sorted(unknown))}: expected some of {', '.join(names)}")
+        raise ValueError(f"--only {', '.join(sorted(unknown))}: expected some of {', '.join(names)}")
     JSON.mkdir(parents=True, exist_ok=True)
     chosen = options.only or tuple(names)
     for run in ALL:
@@ -161,10 +163,11 @@ def main(options: Options) -> None:
         film.record()
 
 
+def main(command_line: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    rerun(read_options(Options, command_line, PROG, __doc__))
+    return 0
+
+
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options, prog="benchmarks.paper.runs"))
-    except (ValueError, OSError) as failure:
-        sys.exit(f"runs: error: {' '.join(str(failure).split())}")
-    except KeyboardInterrupt:
-        sys.exit("interrupted: the same command goes on from here")
+    run_command(PROG, main)

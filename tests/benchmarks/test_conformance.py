@@ -1,9 +1,11 @@
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 
 from benchmarks import conformance
+from mujoban_core.program import exit_status
 from mujoban_sim.presets import EASED, REFERENCE
 
 LEVEL = "\n".join(["##########", *["#        #"] * 3, "# @ $ .  #", *["#        #"] * 4, "##########"])
@@ -44,8 +46,9 @@ def test_a_world_conforms_to_its_own_runs_and_another_does_not(recorded):
 
 
 def test_a_folder_without_runs_and_a_malformed_file_are_one_line(tmp_path, capsys):
-    assert conformance.main([str(tmp_path)]) == 2
+    run = partial(conformance.main, [str(tmp_path)])
+    assert exit_status("conformance", run) == 2
     (tmp_path / "runs.json").write_text('[{"kind": "push"}]')
-    assert conformance.main([str(tmp_path)]) == 2
+    assert exit_status("conformance", run) == 2
     error = capsys.readouterr().err.splitlines()
     assert len(error) == 2 and "not a list of recorded runs" in error[1]

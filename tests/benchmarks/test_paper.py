@@ -100,8 +100,8 @@ def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
         (tmp_path / name / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     points = curves.read_curve("controller", [tmp_path / "first", tmp_path / "second"])
     assert [(p["step"], p["value"]) for p in points] == [(10, 0.625), (20, 0.625), (30, 0.625), (40, 0.625)]
-    curves.main(curves.Options(controller=(tmp_path / "first", tmp_path / "second"), variant="mpo", out=tmp_path))
-    curves.main(curves.Options(controller=(tmp_path / "first",) * 2, variant="mpo", append=True, out=tmp_path))
+    curves.write(curves.Options(controller=(tmp_path / "first", tmp_path / "second"), variant="mpo", out=tmp_path))
+    curves.write(curves.Options(controller=(tmp_path / "first",) * 2, variant="mpo", append=True, out=tmp_path))
     written = [json.loads(line)["step"] for line in (tmp_path / "curve_controller_mpo.jsonl").read_text().splitlines()]
     assert written == [10, 20, 30, 40, 50, 60, 70, 80]
     with pytest.raises(runs.ResultError, match="fewer than 3 points of evaluation/success_rate/5"):
