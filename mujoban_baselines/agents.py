@@ -124,6 +124,11 @@ class StructuredAgent(TopDownAgent):
             nn.Flatten(), nn.Linear(16 * cells, _VIEW), nn.ReLU(),
         )  # fmt: skip
 
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """What is seen, and the state to reach."""
+        return (*self.sees, "subgoal")
+
     def embed(self, sights: Mapping[str, Tensor]) -> Tensor:
         """Return the encoding of what is seen, [M, embedded]."""
         maps = torch.cat([sights["abstract_state"], sights["subgoal"]], -1).to(self.mean.weight.dtype)

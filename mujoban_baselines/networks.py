@@ -130,6 +130,11 @@ class RecurrentAgent(nn.Module, Agent):
         self.mean, self.scale = gaussian_layers(self.width, self.action_size)
 
     @property
+    def reads(self) -> tuple[str, ...]:
+        """What `forward` reads: what is seen, and what `look` adds to it."""
+        return self.sees
+
+    @property
     @abstractmethod
     def sense(self) -> BodySense:
         """What reads proprioception; it is normalised by what training meets first."""

@@ -20,7 +20,7 @@ from mujoban_planner.boards import BitBoards
 from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
 from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
 from mujoban_planner.validation import success_rates
-from mujoban_rl.actors import ActorOptions, ActorSource, Arrays, Experience
+from mujoban_rl.actors import ActorOptions, ActorSource, Arrays, Rollouts
 from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.ppo import PPOConfig, generalised_advantages, ppo_loss
@@ -131,29 +131,6 @@ class PushPPOLearner(Learner[Arrays]):
         save_weights(directory.path / "planner.safetensors", planner, planner.config, record)
 
 
-class Rollouts:
-    """Hands on what actors delivered, once."""
-
-    def __init__(self) -> None:
-        self._parts: list[Arrays] = []
-
-    def add(self, experience: Experience) -> None:
-        """Take the rollout of an actor."""
-        self._parts.append(experience.arrays)
-
-    def sample(self) -> Arrays:
-        """Return the rollouts of all actors since the last call, side by side."""
-        parts, self._parts = self._parts, []
-        return {name: np.concatenate([part[name] for part in parts], axis=-1) for name in parts[0]}
-
-    def state(self) -> State:
-        """Return nothing: between two updates there is nothing."""
-        return State()
-
-    def restore(self, state: State) -> None:
-        """Take over nothing."""
-
-
 def push_ppo(
     config: PushPPOConfig, directory: Path, cadence: Cadence, actors: ActorOptions | None = None
 ) -> Trainer[Arrays]:
@@ -161,7 +138,7 @@ def push_ppo(
     options = actors or ActorOptions()
     pool = options.pool(partial(PushActor, config.network, config.play))
     steps = config.play.steps * config.play.environments * options.num_actors
-    source = ActorSource(pool, Rollouts(), steps_per_update=steps)
+    source = ActorSource(pool, Rollouts(axis=-1), steps_per_update=steps)
     return Trainer(
         RunDirectory(directory, config),
         PushPPOLearner(config),

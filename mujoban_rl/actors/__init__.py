@@ -10,7 +10,7 @@ A trainer needs two classes of its own: an `Actor` with a picklable factory, and
 from mujoban_rl.actors.actor import Actor, ActorError, ActorFactory, Arrays, Experience
 from mujoban_rl.actors.options import ActorOptions
 from mujoban_rl.actors.pool import ActorPool, Schedule
-from mujoban_rl.actors.source import ActorSource, ExperienceStore
+from mujoban_rl.actors.source import ActorSource, ExperienceStore, Rollouts
 
 __all__ = [
     "Actor",
@@ -22,5 +22,6 @@ __all__ = [
     "Arrays",
     "Experience",
     "ExperienceStore",
+    "Rollouts",
     "Schedule",
 ]

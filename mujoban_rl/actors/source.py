@@ -9,7 +9,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from torch import Tensor
 
-from mujoban_rl.actors.actor import Experience
+from mujoban_rl.actors.actor import Arrays, Experience
 from mujoban_rl.actors.pool import ActorPool
 from mujoban_rl.engine import Scalars, Source, State
 
@@ -122,3 +122,28 @@ class ActorSource(Source[BatchT], Generic[BatchT]):
     def close(self) -> None:
         """End the actors."""
         self.pool.close()
+
+
+class Rollouts:
+    """Hands on what actors delivered, once: the store of methods that learn from the newest experience alone."""
+
+    def __init__(self, axis: int) -> None:
+        """Put the arrays of actors side by side along an axis, that of their environments."""
+        self._axis = axis
+        self._parts: list[Arrays] = []
+
+    def add(self, experience: Experience) -> None:
+        """Take the rollout of an actor."""
+        self._parts.append(experience.arrays)
+
+    def sample(self) -> Arrays:
+        """Return the rollouts of all actors since the last call."""
+        parts, self._parts = self._parts, []
+        return {name: np.concatenate([part[name] for part in parts], axis=self._axis) for name in parts[0]}
+
+    def state(self) -> State:
+        """Return nothing: between two updates there is nothing."""
+        return State()
+
+    def restore(self, state: State) -> None:
+        """Take over nothing."""

@@ -1,0 +1,108 @@
+"""Whether the agents of Table 1 are sound: each learns a small task on pixels from nothing, by the code that trains it.
+
+    python -m benchmarks.golden                      # all of them: JSON, status 1 if one has not solved it
+    python -m benchmarks.golden --agents mpo-symmetric --cpu-minutes 5
+
+The task is `mujoban_baselines.squares`: walk to the red square and not to the blue one, in frames of 64x64. By chance
+half of the squares that are reached are red.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import torch
+import tyro
+
+from mujoban_baselines.agents import StructuredAgent, TopDownAgent
+from mujoban_baselines.impala import VTraceTrainingConfig
+from mujoban_baselines.mpo import MPOTrainingConfig
+from mujoban_baselines.squares import SquaresTask
+from mujoban_baselines.task import TaskConfig
+from mujoban_baselines.train import MPORunConfig, Parts, VTraceRunConfig, mpo_parts, vtrace_parts
+from mujoban_rl.actors import ActorOptions
+from mujoban_rl.limits import NaNGuard
+
+SOLVED: Final = 0.9
+"""Share of episodes that must end at the red square."""
+_BETWEEN: Final = 20
+"""Updates between two looks at how far it is."""
+_QUICK: Final = MPOTrainingConfig(
+    window=12, warm_up=2, windows=16, replay=12_000, first=2_000, n_step=3, reuse=2.0, rate=1e-3, gamma=0.95
+)
+
+
+_ROBOTS: Final = 16
+_UNROLL: Final = VTraceTrainingConfig(unroll=10, rate=1e-3, gamma=0.95)
+
+
+def _mpo(critic: Any) -> Parts:
+    return mpo_parts(MPORunConfig(critic=critic, mpo=_QUICK), ActorOptions(), partial(SquaresTask, batch=_ROBOTS))
+
+
+def _vtrace(kind: type[TopDownAgent]) -> Parts:
+    config = VTraceRunConfig(task=TaskConfig(robots=_ROBOTS), vtrace=_UNROLL)
+    return vtrace_parts(config, kind, ActorOptions(), partial(SquaresTask, batch=_ROBOTS))
+
+
+AGENTS: Final[dict[str, Callable[[], Parts]]] = {
+    "mpo-asymmetric": partial(_mpo, "asymmetric"),
+    "mpo-symmetric": partial(_mpo, "symmetric"),
+    "vtrace-monolithic": partial(_vtrace, TopDownAgent),
+    "vtrace-structured": partial(_vtrace, StructuredAgent),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train agents on a small task until they have solved it."""
+
+    agents: tuple[str, ...] = tuple(AGENTS)
+    cpu_minutes: float = 20.0
+    """Of one core, for each agent."""
+
+
+def learn(name: str, cpu_seconds: float) -> dict[str, Any]:
+    """Train an agent until it has solved the task or has spent its time; return what it took."""
+    (learner, source), guard = AGENTS[name](), NaNGuard()
+    source.publish(learner.weights(), 0)
+    start, curve = time.process_time(), [(0, 0.0)]
+    while time.process_time() - start < cpu_seconds:
+        for update in range(_BETWEEN):
+            batch = source.next_batch()
+            learner.update(batch, (time.process_time() - start) / cpu_seconds, guard)
+            if update % 2:
+                source.publish(learner.weights(), update)
+        seen = source.statistics()
+        if "solved" in seen:
+            curve.append((source.samples, round(seen["solved"], 3)))
+            print(f"{name}: {source.samples} steps, solved {curve[-1][1]:.0%}", file=sys.stderr, flush=True)
+        if len(curve) > 1 and min(value for _, value in curve[-2:]) >= SOLVED:
+            break
+    source.close()
+    spent = time.process_time() - start
+    return {"solved": curve[-1][1], "steps": source.samples, "cpu_seconds": round(spent, 1), "curve": curve}
+
+
+def main(options: Options) -> int:
+    """Train the agents that are named; return 1 if one has not solved the task."""
+    torch.set_num_threads(1)
+    unknown = set(options.agents) - AGENTS.keys()
+    if unknown:
+        raise ValueError(f"--agents {min(unknown)}: expected some of {', '.join(AGENTS)}")
+    report = {name: learn(name, 60.0 * options.cpu_minutes) for name in options.agents}
+    print(json.dumps(report, indent=2))
+    return int(any(outcome["solved"] < SOLVED for outcome in report.values()))
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(tyro.cli(Options, prog="benchmarks.golden")))
+    except ValueError as failure:
+        sys.exit(f"golden: error: {failure}")

@@ -1,0 +1,196 @@
+"""Train an agent of Table 1: `python -m mujoban_baselines.train monolithic-mpo|monolithic-vtrace|structured-vtrace`.
+
+Give the directory again to resume a run; it leaves `agent.safetensors`, for `bringup/evaluate.py --agent`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+import tyro
+
+from mujoban_baselines.actor import TaskFactory, make_actor
+from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAgent
+from mujoban_baselines.critics import AsymmetricCritic, Critic, SymmetricCritic
+from mujoban_baselines.impala import VTraceLearner, VTraceTrainingConfig
+from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, ReplayStore
+from mujoban_baselines.task import MujobanTask, TaskConfig
+from mujoban_core.program import read_options, run_command
+from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
+from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.weights import provenance
+
+PROG = "mujoban_baselines.train"
+Size = Literal["S", "M", "L"]
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What must not change between the bits of a run, whatever the method."""
+
+    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(default_factory=TaskConfig)
+    steps: int = 20_000_000
+    """Environment steps of all robots together at which the run is complete."""
+    cpu_seconds: float = 1e9
+    """CPU seconds of all its processes at which it is complete, if its steps have not come first."""
+    seed: int = 0
+
+    @property
+    def budget(self) -> Budget:
+        """When the run is complete."""
+        return Budget(samples=self.steps, cpu_seconds=self.cpu_seconds)
+
+
+@dataclass(frozen=True)
+class MPORunConfig(RunConfig):
+    """A run of monolithic MPO."""
+
+    size: Size = "S"
+    """Variant of the network."""
+    critic: Literal["asymmetric", "symmetric"] = "asymmetric"
+    """What the critic sees: the simulator's truth, or what the agent sees, on one torso."""
+    mpo: MPOTrainingConfig = field(default_factory=MPOTrainingConfig)
+
+
+@dataclass(frozen=True)
+class VTraceRunConfig(RunConfig):
+    """A run of V-trace."""
+
+    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: TaskConfig(levels="curriculum")
+    )
+    vtrace: VTraceTrainingConfig = field(default_factory=VTraceTrainingConfig)
+
+
+Parts = tuple[Learner[Any], Source[Any]]
+"""What a trainer drives."""
+
+
+def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | None = None) -> Parts:
+    """Return learner and source of monolithic MPO (paper D.1), on Mujoban or on a task of one's own."""
+    torch.manual_seed(config.seed)  # the initial weights
+    body, mpo = config.task.body, config.mpo
+    build = partial(MonolithicAgent, body, config.size)
+    agent = build()
+    critic: Critic = AsymmetricCritic(body) if config.critic == "asymmetric" else SymmetricCritic(body, agent.width)
+    streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(2)]
+    generators = [torch.Generator().manual_seed(seed) for seed in streams]
+    plays = task or partial(MujobanTask, config.task)
+    factory = partial(make_actor, plays, build, mpo.window, mpo.overlap, critic.sees, config.seed)
+    store = ReplayStore(mpo, generators[0])
+    source = ActorSource(
+        actors.pool(factory), store, steps_per_update=mpo.steps_per_update, first_steps=mpo.first
+    )
+    return MPOLearner(agent, critic, mpo, generators[1]), source
+
+
+def vtrace_parts(
+    config: VTraceRunConfig, kind: type[TopDownAgent], actors: ActorOptions, task: TaskFactory | None = None
+) -> Parts:
+    """Return learner and source of V-trace with an agent of a kind (paper D.2)."""
+    torch.manual_seed(config.seed)  # the initial weights
+    unroll, build = config.vtrace, partial(kind, config.task.body)
+    plays = task or partial(MujobanTask, config.task)
+    factory = partial(make_actor, plays, build, unroll.length, 1, (), config.seed)
+    steps = unroll.unroll * config.task.robots * actors.num_actors
+    source = ActorSource(actors.pool(factory), Rollouts(axis=1), steps_per_update=steps)
+    return VTraceLearner(build(), unroll), source
+
+
+def make_trainer(config: RunConfig, parts: Parts, run: Path, cadence: Cadence, method: str) -> Trainer[Any]:
+    """Make, or resume, a run."""
+    directory = RunDirectory(run, {**asdict(config), "method": method})
+    record = {
+        **provenance(),
+        "training": directory.config,
+        "data": f"own play of generated levels ({config.task.levels}), training seeds",
+        "world": config.task.world,
+    }
+    return Trainer(directory, *parts, config.budget, cadence, record=record)
+
+
+@dataclass(frozen=True)
+class _Command(ABC):
+    """What all trainings have in common."""
+
+    run: Path
+    """Run directory; an existing one is resumed."""
+    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
+    """Where the robots are."""
+    seconds: float | None = None
+    """Stop after so many seconds; resume later."""
+    save_every: float = 300.0
+    """Seconds between checkpoints."""
+    threads: int = 1
+    """Threads of the networks."""
+
+    @abstractmethod
+    def trainer(self) -> Trainer[Any]:
+        """Make or resume the run."""
+
+    def cadence(self, log_updates: int, publish_updates: int) -> Cadence:
+        """Return how often the run logs, publishes and saves."""
+        return Cadence(log_updates, publish_updates, save_seconds=self.save_every)
+
+
+@dataclass(frozen=True)
+class MonolithicMPO(_Command):
+    """Monolithic RL: camera, proprioception and pose to torques, by MPO (paper D.1)."""
+
+    config: Annotated[MPORunConfig, tyro.conf.arg(name="")] = field(default_factory=MPORunConfig)
+
+    def trainer(self) -> Trainer[Any]:
+        """Make or resume the run."""
+        parts = mpo_parts(self.config, self.actors)
+        return make_trainer(self.config, parts, self.run, self.cadence(50, 5), "monolithic-mpo")
+
+
+@dataclass(frozen=True)
+class MonolithicVTrace(_Command):
+    """Fully observable monolithic RL: view from above and proprioception to torques, by V-trace (paper D.2)."""
+
+    config: Annotated[VTraceRunConfig, tyro.conf.arg(name="")] = field(default_factory=VTraceRunConfig)
+
+    def trainer(self) -> Trainer[Any]:
+        """Make or resume the run."""
+        parts = vtrace_parts(self.config, TopDownAgent, self.actors)
+        return make_trainer(self.config, parts, self.run, self.cadence(20, 1), "monolithic-vtrace")
+
+
+@dataclass(frozen=True)
+class StructuredVTrace(_Command):
+    """Fully observable structured RL: also the abstract state, and pseudo rewards for adjacent ones (paper D.2)."""
+
+    config: Annotated[VTraceRunConfig, tyro.conf.arg(name="")] = field(default_factory=VTraceRunConfig)
+
+    def trainer(self) -> Trainer[Any]:
+        """Make or resume the run."""
+        parts = vtrace_parts(self.config, StructuredAgent, self.actors)
+        return make_trainer(self.config, parts, self.run, self.cadence(20, 1), "structured-vtrace")
+
+
+COMMANDS: dict[str, type[_Command]] = {
+    "monolithic-mpo": MonolithicMPO,
+    "monolithic-vtrace": MonolithicVTrace,
+    "structured-vtrace": StructuredVTrace,
+}
+
+
+def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
+    """Run the command line."""
+    command = read_options(COMMANDS, command_line, prog, __doc__)
+    torch.set_num_threads(command.threads)
+    command.trainer().run(limit_seconds=command.seconds)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(PROG, main)

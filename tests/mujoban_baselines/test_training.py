@@ -1,0 +1,171 @@
+"""Training agents: promises of every trainer, returns at the end of time, levels by the paper's shares."""
+
+import json
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from mujoban_baselines.actor import make_actor
+from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAgent
+from mujoban_baselines.critics import Critic
+from mujoban_baselines.impala import VTraceTrainingConfig
+from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig
+from mujoban_baselines.networks import AgentOutput, Recurrent
+from mujoban_baselines.squares import SquaresTask
+from mujoban_baselines.task import LEVELS, MujobanTask, TaskConfig
+from mujoban_baselines.train import MPORunConfig, VTraceRunConfig, main, make_trainer, mpo_parts, vtrace_parts
+from mujoban_rl.actors import ActorOptions
+from mujoban_rl.engine import Cadence
+from mujoban_rl.limits import NaNGuard
+from mujoban_rl.networks import Gaussian
+from mujoban_rl.testing import check_refusal, check_resuming
+from mujoban_sokoban.generator import TRAIN_SEEDS
+
+SMALL = MPOTrainingConfig(window=6, warm_up=1, n_step=2, windows=4, replay=120, first=1, samples=4, target_period=2)
+CADENCE = Cadence(log_updates=2, publish_updates=1)
+
+
+def mpo(folder, critic="asymmetric"):
+    config = MPORunConfig(task=TaskConfig(robots=4), critic=critic, mpo=SMALL)
+    parts = mpo_parts(config, ActorOptions(), partial(SquaresTask, batch=4))
+    return make_trainer(config, parts, folder, CADENCE, "mpo")
+
+
+def structured(folder):
+    config = VTraceRunConfig(task=TaskConfig(robots=2), vtrace=VTraceTrainingConfig(unroll=3))
+    parts = vtrace_parts(config, StructuredAgent, ActorOptions(), partial(SquaresTask, batch=2))
+    return make_trainer(config, parts, folder, CADENCE, "structured")
+
+
+@pytest.mark.parametrize("make", [mpo, partial(mpo, critic="symmetric"), structured])
+def test_a_run_goes_on_where_it_stopped_and_a_batch_with_nan_changes_nothing(make, tmp_path):
+    check_resuming(make, tmp_path, stop_at=2, updates=4)
+
+    def poison(batch):
+        return {name: values * math.nan if name == "reward" else values for name, values in batch.items()}
+
+    check_refusal(make(tmp_path / "nan"), poison)
+
+
+class Blank(Critic):
+    """Holds every action to be worth nothing."""
+
+    def state(self, batch, features):
+        return torch.zeros(*features.shape[:2], 128)
+
+    def forward(self, state, action):
+        return torch.zeros(action.shape[:-1])
+
+
+@pytest.mark.parametrize(
+    ("ending", "target"),
+    [
+        (None, 1.0 + 0.5 * 1.0 + 0.25 * 80.0),
+        (("terminated", 2), 1.0 + 0.5 * 1.0),
+        (("truncated", 2), 1.0 + 0.5 * 40.0),
+        (("terminated", 1), 1.0),
+        (("truncated", 1), None),
+    ],
+)
+def test_returns_end_with_an_episode_but_go_on_from_where_time_ran_out(ending, target):
+    """One return of two steps from tick 1 of 4, gamma 0.5, V = 10, 20, 40, 80."""
+    settings = MPOTrainingConfig(window=4, warm_up=1, n_step=2, windows=1, gamma=0.5)
+    learner = MPOLearner(MonolithicAgent(), Blank("ball"), settings, torch.Generator())
+    batch = {name: torch.zeros(1, 4, dtype=torch.bool) for name in ("terminated", "truncated")}
+    batch |= {"reward": torch.ones(1, 4), "action": torch.zeros(1, 4, 2)}
+    if ending is not None:
+        batch[ending[0]][0, ending[1]] = True
+    online = AgentOutput(Gaussian(*torch.zeros(2, 1, 3, 2)), torch.zeros(1, 3, 256), Recurrent(*torch.zeros(2, 1, 8)))
+    loss = learner._critic_loss(batch, online, torch.tensor([[10.0, 20.0, 40.0, 80.0]]))
+    assert loss.item() == pytest.approx(0.0 if target is None else 0.5 * target**2)
+
+
+def test_a_step_in_which_time_runs_out_teaches_v_trace_nothing():
+    config = VTraceRunConfig(vtrace=VTraceTrainingConfig(unroll=2), task=TaskConfig(robots=2))
+    learner, source = vtrace_parts(config, TopDownAgent, ActorOptions(), partial(SquaresTask, batch=2))
+    source.publish(learner.weights(), 0)
+    batch = dict(source.next_batch())
+    batch["reward"] = np.full_like(batch["reward"], 7.0)
+    losses = {}
+    for name in ("terminated", "truncated"):
+        ended = {"terminated": np.zeros((3, 2), np.bool_), "truncated": np.zeros((3, 2), np.bool_)}
+        ended[name][:] = True
+        losses[name] = learner.update({**batch, **ended}, 0.0, NaNGuard())["vtrace/value_loss"]
+    assert losses["truncated"] == 0.0 and losses["terminated"] > 1.0
+
+
+def test_mujoban_goes_on_to_the_bit_from_its_state():
+    def play(task, steps):
+        for _ in range(steps):
+            step = task.step(np.full((3, 2), 0.3, np.float32))
+            task.renew(np.flatnonzero(step.over))
+        return task.observe(("proprio", "pose", "abstract_state"))
+
+    config = TaskConfig(levels="curriculum", robots=3, episode_seconds=0.3)
+    whole, parts = (MujobanTask(config, np.random.default_rng(seed)) for seed in (0, 1))
+    play(whole, 4)
+    parts.restore(whole.state())
+    for one, other in zip(play(whole, 8).values(), play(parts, 8).values(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_an_actor_notes_what_subgoals_paid():
+    """A subgoal that is reached pays 0.1, and its sub-episode ends."""
+    actor = make_actor(
+        partial(MujobanTask, TaskConfig(robots=3, episode_seconds=5.0)), StructuredAgent, 61, 1, (), 0, 0
+    )
+    arrays = actor.act().arrays
+    actor.close()
+    over, reward = arrays["pseudo_over"], arrays["pseudo_reward"]
+    assert set(np.unique(reward)) <= {0.0, np.float32(0.1)} and over[reward > 0].all()
+    assert over.any(), "50 steps have passed"
+    changed = (arrays["subgoal"][1:] != arrays["subgoal"][:-1]).any((2, 3, 4))
+    assert (changed <= over[:-1]).all(), "a subgoal holds until its sub-episode ends"
+
+
+def test_levels_are_training_levels_in_the_shares_of_the_paper():
+    assert all(sum(shares.values()) == pytest.approx(1.0) for shares in LEVELS.values())
+    assert LEVELS["curriculum"] == {1: 0.25, 2: 0.25, 3: 0.2, 4: 0.2, 5: 0.1}
+    task = MujobanTask(TaskConfig(levels="curriculum", robots=40, episode_seconds=0.1), np.random.default_rng(0))
+    assert all(episode.seed in TRAIN_SEEDS for episode in task.world.episodes)
+    for _ in range(2):
+        step = task.step(np.zeros((40, 2), np.float32))
+    assert step.truncated.all(), "two steps are 0.1 s"
+    outcomes = task.renew(np.arange(40))
+    assert len({name for name in outcomes if name.startswith("solved/")}) >= 4
+    task.close()
+    with pytest.raises(ValueError, match=r"episode_seconds 0\.0: expected at least 1"):
+        TaskConfig(episode_seconds=0.0)
+
+
+def test_a_run_by_command_leaves_an_agent_and_a_curve(tmp_path, capsys):
+    run = tmp_path / "run"
+    options = ["--robots", "2", "--levels", "easy", "--episode-seconds", "0.5", "--steps", "60"]
+    small = ["--vtrace.unroll", "5"]
+    assert main(["monolithic-vtrace", "--run", str(run), *options, *small]) == 0
+    record = json.loads((run / "agent.json").read_text())
+    assert record["class"] == TopDownAgent.__name__ and record["training"]["method"] == "monolithic-vtrace"
+    curve = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert record["samples"] >= 60 and curve is not None
+    with pytest.raises(ValueError, match=r"window 9: expected more ticks"):
+        replace(SMALL, window=9, warm_up=4, n_step=5)
+
+
+def test_symmetric_critics_teach_the_torso_and_asymmetric_ones_do_not():
+    moved = {}
+    for critic in ("symmetric", "asymmetric"):
+        config = MPORunConfig(critic=critic, mpo=SMALL)
+        learner, source = mpo_parts(config, ActorOptions(), partial(SquaresTask, batch=4))
+        source.publish(learner.weights(), 0)
+        batch = source.next_batch()
+        agent: MonolithicAgent = learner.agent
+        with torch.no_grad():
+            value = torch.zeros(batch["reward"].shape)
+        loss = learner._critic_loss(batch, learner._over(agent, batch, SMALL.warm_up), value)
+        loss.backward()
+        moved[critic] = any(p.grad is not None and bool(p.grad.any()) for p in agent.parameters())
+    assert moved == {"symmetric": True, "asymmetric": False}
