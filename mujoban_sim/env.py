@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ClosedEnvironmentError
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import Body
@@ -84,6 +85,12 @@ def check_observation_set(name: str) -> tuple[str, ...]:
     if name not in OBSERVATION_SETS:
         raise ValueError(f"unknown observation set {name!r}: expected one of {', '.join(OBSERVATION_SETS)}")
     return OBSERVATION_SETS[name]
+
+
+def check_open(closed: bool) -> None:
+    """Raise an error if an environment has been closed."""
+    if closed:
+        raise ClosedEnvironmentError("the environment is closed: make a new one with gymnasium.make")
 
 
 class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
@@ -180,6 +187,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"unknown render_mode {render_mode!r}: expected None or 'rgb_array'")
         self.render_mode = render_mode
+        self._closed = False
         self._source = LevelSource.make(difficulty, level_file)
         self._names = check_observation_set(observations)
         self.world = World(
@@ -191,7 +199,12 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; see the class for what `seed` and `options` do."""
+        """Start an episode; see the class for what `seed` and `options` do.
+
+        Raises:
+            ClosedEnvironmentError: after `close`, as of `step` and `render`.
+        """
+        check_open(self._closed)
         super().reset(seed=seed)
         chosen = draw_seed(self.np_random) if seed is None else seed
         level = (options or {}).get("level")
@@ -207,6 +220,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
         Raises:
             TorqueError: if they are malformed; nothing has moved then.
         """
+        check_open(self._closed)
         world = self.world
         world.step(np.asarray(action)[None])
         solved = bool(world.solved[0])
@@ -215,12 +229,14 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """Return a view from above, uint8 [256, 256, 3], if the render mode is ``"rgb_array"``."""
+        check_open(self._closed)
         if self.render_mode is None:
             return None
         return self.world.render("top_down", size=RENDER_SIZE)[0]
 
     def close(self) -> None:
-        """Free the cameras."""
+        """Free the cameras; nothing but `close` may be called after."""
+        self._closed = True
         self.world.close()
 
     def _observe(self) -> Observations:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,3 +69,33 @@ def check_snapshot(snapshot: Snapshot, shapes: Mapping[str, tuple[int, ...]]) ->
             raise ValueError(f"{name} of the snapshot has shape {array.shape}: expected {shape}, all finite")
     if _LEVEL not in snapshot or snapshot[_LEVEL].shape[:1] != rows or snapshot[_LEVEL].dtype != np.uint8:
         raise ValueError(f"the snapshot lacks {_LEVEL}: expected level texts as bytes")
+
+
+class Portable:
+    """A world that `copy.deepcopy` and pickle carry: by what made it and a snapshot of its episodes.
+
+    Physics and OpenGL, which cannot be carried, are made anew; the copy continues to the last bit.
+    """
+
+    _made_of: tuple[tuple[Any, ...], dict[str, Any]]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Note what the world is made of."""
+        world = super().__new__(cls)
+        world._made_of = args, kwargs
+        return world
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to make an equal world."""
+        world: Any = self
+        rows = [row for row, episode in enumerate(world.episodes) if episode is not None]
+        return _make_again, (type(self), *self._made_of, rows, world.snapshot(rows) if rows else {})
+
+
+def _make_again(
+    kind: type[Any], args: tuple[Any, ...], kwargs: dict[str, Any], rows: list[int], snapshot: Snapshot
+) -> Any:
+    world = kind(*args, **kwargs)
+    if rows:
+        world.restore(rows, snapshot)
+    return world

@@ -20,6 +20,7 @@ from mujoban_sim.env import (
     Observations,
     ObservationSet,
     check_observation_set,
+    check_open,
     draw_seed,
     observation_space,
     observe,
@@ -102,6 +103,7 @@ class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]
         Raises:
             ValueError: if the number of seeds or the mask's shape is wrong, or nothing is to be reset.
         """
+        check_open(self.closed)
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(f"reset_mask {mask!r}: expected {self.num_envs} booleans, one of them true at least")
@@ -137,6 +139,7 @@ class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]
             TorqueError: if they are malformed; nothing has moved then.
             RuntimeError: if an episode has ended and, with autoreset disabled, has not been reset.
         """
+        check_open(self.closed)
         world, mode = self.world, self.metadata["autoreset_mode"]
         if mode == AutoresetMode.DISABLED and self._ended.any():
             raise RuntimeError(f"environments {np.flatnonzero(self._ended).tolist()} have ended: reset them first")
@@ -169,6 +172,7 @@ class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a view from above for each environment if the render mode is ``"rgb_array"``."""
+        check_open(self.closed)
         if self.render_mode is None:
             return None
         return tuple(self.world.render("top_down", size=RENDER_SIZE))

@@ -23,7 +23,7 @@ from mujoban_sim.checks import check_levels, check_rows, hand_over_torque
 from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
 from mujoban_sim.presets import DEFAULT_WORLD, get_world
 from mujoban_sim.scene import BOX_COORDINATES, SceneCache, settled_positions
-from mujoban_sim.snapshots import Snapshot, check_snapshot, decode_episodes, encode_episodes
+from mujoban_sim.snapshots import Portable, Snapshot, check_snapshot, decode_episodes, encode_episodes
 from mujoban_sim.world_kernels import KernelState, pack, update
 from mujoban_sokoban.episodes import EpisodeSpec
 
@@ -48,7 +48,7 @@ def initial_heading(seed: int) -> float:
     return float(np.random.default_rng([_HEADING_STREAM, seed]).uniform(-np.pi, np.pi))
 
 
-class World:
+class World(Portable):
     """B independent Mujoban worlds that step together at 20 Hz.
 
     A row is an episode: `reset` starts it, `instruct` tells which instruction it follows, `step` applies

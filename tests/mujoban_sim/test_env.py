@@ -1,8 +1,11 @@
+import copy
+import pickle
 import warnings
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
@@ -153,3 +156,46 @@ def test_disabled_autoreset_resets_where_the_mask_says():
     assert env.world.steps.tolist() == [2, 0]
     with pytest.raises(ValueError, match="reset_mask"):
         env.reset(options={"reset_mask": np.zeros(2, bool)})
+
+
+@pytest.mark.parametrize("carry", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: gymnasium.make("Mujoban-v0", difficulty=2, time_limit=25),
+        lambda: MujobanVectorEnv(2, difficulty=2, time_limit=25, autoreset_mode=AutoresetMode.NEXT_STEP),
+    ],
+)
+def test_a_copy_continues_as_its_original_does_into_the_next_episodes(make, carry):
+    env = make()
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (30, *env.action_space.shape)).astype(np.float32)
+    env.reset(seed=3)
+    for action in actions[:10]:
+        env.step(action)
+    twin = carry(env)
+
+    def play(played):
+        frames = []
+        for action in actions[10:]:
+            observation, reward, terminated, truncated, _ = played.step(action)
+            if np.ndim(truncated) == 0 and (terminated or truncated):
+                observation, _ = played.reset()
+            frames.append((*observation.values(), reward, terminated, truncated))
+        return frames
+
+    for ours, theirs in zip(play(env), play(twin), strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
+    env.close()
+    twin.close()
+
+
+@pytest.mark.parametrize("make", [MujobanEnv, MujobanVectorEnv])
+def test_a_closed_environment_says_so(make):
+    env = make(observations="state", difficulty=1, render_mode="rgb_array")
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    for call in (lambda: env.step(np.zeros(env.action_space.shape, np.float32)), env.render, env.reset):
+        with pytest.raises(ClosedEnvironmentError, match="the environment is closed: make a new one"):
+            call()
