@@ -128,13 +128,20 @@ def read_options(
 
 
 _BOX: Final = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]")
+_RULE: Final = re.compile(r"^(?:─+|-{3,})$", re.MULTILINE)
 
 
 def _one_line(box: str) -> str:
-    """Return in one line what tyro says in a box: what is wrong, and what it expects."""
+    """Return in one line what tyro says in a box: what is wrong, and what it expects.
+
+    The first row is the box's title; where stdout is not UTF-8, rules are hyphens.
+    """
     rows = [_BOX.sub("", row).strip() for row in box.splitlines()][1:]
-    sections = [part.split("\n") for part in re.split(r"\n─+\n", "\n".join(row for row in rows if row))]
+    parts = _RULE.split("\n".join(row for row in rows if row))
+    sections = [part.strip().split("\n") for part in parts if part.strip()]
     wrong = " ".join(sections[0]).removeprefix("Error parsing ")
+    if empty := re.match(r"Missing value for argument '(--\S+)'", wrong):
+        return f"{empty[1]} has no value, expected one"
     if "xpected" in wrong:
         return re.sub(r"^(--[\w-]+): ", r"\1 ", wrong[0].lower() + wrong[1:])
     if missing := re.match(r".*[Mm]issing from .*?: (--\S+)", wrong):
