@@ -21,8 +21,9 @@ from benchmarks.command import run_benchmark
 from benchmarks.graph import Options
 from bringup.command import Stack
 from bringup.domain import claim_domain
-from bringup.live import free_port
+from bringup.live_server import free_port
 from bringup.monitor import MonitorNode
+from bringup.options import LOOPBACK
 from bringup.results import EpisodeResult
 from bringup.stack import PlayOptions, play, viewer
 from mujoban_sokoban.episodes import Episodes
@@ -72,7 +73,7 @@ def run(options: Options | None = None) -> dict[str, float]:
         for _ in range(chosen.rounds):
             plain.append(_measure(stack, episodes, chosen.ticks))
             port = free_port(WEB_PORT)
-            with viewer():
+            with viewer(LOOPBACK):
                 _await_page(port)
                 viewed.append(_measure(stack, episodes, chosen.ticks))
     pairs = list(zip(plain, viewed, strict=True))

@@ -59,7 +59,7 @@ class Choice:
     def identity(self) -> str:
         """Return the SHA-256 digest of the weights in use, or what stands in for a learned module.
 
-        A class of the user's own that receives the ground truth, as oracles do, is named so.
+        What receives the ground truth, as oracles do, is named so: a class of the user's own, or a teacher's weights.
 
         Raises:
             WeightsError: If the weights are missing.
@@ -74,7 +74,8 @@ class Choice:
         path = self.weights or shipped_weights(self.role)
         if not path.is_file():
             raise WeightsError(f"no weights of the {self.role} at {path}: expected a .safetensors file")
-        return digest(path)
+        privileged = self.weights is not None and self.load().privileged
+        return f"{digest(path)}{PRIVILEGED if privileged else ''}"
 
 
 @dataclass(frozen=True)

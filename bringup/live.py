@@ -8,31 +8,37 @@ the graph either: it runs at low priority, drops what it has no time for, and dr
 from __future__ import annotations
 
 import os
-import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, Final, NamedTuple, Unpack
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
+from diagnostic_msgs.msg import DiagnosticArray
 from mujoban_msgs.msg import AbstractState, EpisodeTruth, Instruction, Termination
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
 
+from bringup.live_layout import CELL, ESTIMATE, TRUTH, Shown, arrow, blueprint, describe, text, torque_curves
+from bringup.live_server import LiveServer
+from bringup.options import LOOPBACK
 from bringup.overlay import grid_picture
-from mujoban_core.grid import CHANNELS
+from mujoban_core.grid import AGENT, CHANNELS
 from mujoban_core.grid import Instruction as Direction
+from mujoban_core.plugins import ROLES
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import reject
 from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.runtime import diagnostics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare
+from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK, Topic
 
@@ -47,10 +53,6 @@ _QUEUE: Final = 16
 """Ticks that wait for the stream; what comes on top is dropped."""
 _EDGE: Final = 256
 """Pixels along the edge of a picture at most."""
-_MEMORY: Final = "256MiB"
-"""What the stream keeps for a browser that opens the page later."""
-_PORTS: Final = 50
-"""Ports that are tried for one that is free."""
 _MODULES: Final = {
     topics.ABSTRACT_STATE: "estimator",
     topics.TERMINATION: "termination",
@@ -77,6 +79,7 @@ class LiveNode(Node):
 
     Parameters:
         save: Recording (.rrd) to write; empty streams to a viewer.
+        address: IP address on which stream and page are served; 0.0.0.0 for every interface.
         grpc_port: Port on which the stream is served, or the next free one.
         web_port: Port on which the viewer's page is served, or the next free one.
     """
@@ -86,44 +89,47 @@ class LiveNode(Node):
         super().__init__("live", **options)
         self.counts: Counter[str] = Counter()
         fixed = ParameterDescriptor(read_only=True)
-        save = declare(self, "save", "", fixed)
+        save, address = declare(self, "save", "", fixed), declare(self, "address", LOOPBACK, fixed)
         grpc_port, web_port = declare(self, "grpc_port", 9876, fixed), declare(self, "web_port", 9090, fixed)
         self._stream = rr.RecordingStream(APPLICATION)
         self._period = 0.0 if save else _PERIOD
+        self._server: LiveServer | None = None
         if save:
             self._stream.save(save, default_blueprint=blueprint())
         else:
-            self._serve(free_port(grpc_port), free_port(web_port))
+            self._server = LiveServer(address, grpc_port, web_port)
+            self._stream.connect_grpc(self._server.stream, default_blueprint=blueprint())
+            self.get_logger().info(f"live view on {self._server.page}")
+        describe(self._stream)
         self._pictured, self._drawn = -1, 0.0
         self._latest = _Received(-1, 0.0)
         self._torque = _Received(-1, 0.0)
-        self._sequence = -1
+        self._shown = Shown(None, None, {})
+        self._agent = (0.0, 0.0)
+        self._has_named_torques = False
         handlers: dict[Topic, Callable[[int, Any], None]] = {
             topics.TRUE_EPISODE: self._on_episode,
             topics.CAMERA: partial(self._on_image, "camera/first_person"),
-            topics.TRUE_ABSTRACT_STATE: partial(self._on_grid, "grid/ground_truth"),
+            topics.TRUE_ABSTRACT_STATE: partial(self._on_grid, TRUTH),
             topics.TOP_CAMERA: partial(self._on_image, "camera/top_down"),
-            topics.ABSTRACT_STATE: partial(self._on_grid, "grid/estimate"),
+            topics.ABSTRACT_STATE: partial(self._on_grid, ESTIMATE),
             topics.TERMINATION: self._on_termination,
             topics.INSTRUCTION: self._on_instruction,
             topics.TORQUE: self._on_torque,
         }
+        self.create_subscription(DiagnosticArray, diagnostics.TOPIC, self._on_diagnostics, 10)
         qos = live_qos() if save else QoSProfile(depth=_QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT)
         for topic, handle in handlers.items():
             self.create_subscription(topic.type, topic.name, self._receiver(topic, handle), qos, raw=True)
 
     def destroy_node(self) -> None:
         """Finish the stream; a recording is whole only then."""
-        self._stream.flush()
+        if self._server is None:
+            self._stream.flush()
         self._stream.disconnect()
+        if self._server is not None:
+            self._server.close()
         super().destroy_node()
-
-    def _serve(self, grpc_port: int, web_port: int) -> None:
-        address = self._stream.serve_grpc(
-            grpc_port=grpc_port, default_blueprint=blueprint(), server_memory_limit=_MEMORY
-        )
-        rr.serve_web_viewer(web_port=web_port, open_browser=False, connect_to=address)
-        self.get_logger().info(f"live view on http://localhost:{web_port}/?url={address.replace('+', '%2B')}")
 
     def _receiver(self, topic: Topic, handle: Callable[[int, Any], None]) -> Callable[[bytes], None]:
         is_picture, check = topic.type in (Image, AbstractState), checked(topic)
@@ -167,8 +173,23 @@ class LiveNode(Node):
         self._stream.log(f"milliseconds/{what}", rr.Scalars(1000 * (end.at - start.at)))
 
     def _on_episode(self, stamp: int, message: EpisodeTruth) -> None:
+        self._shown = self._shown._replace(episode=message)
         self._stream.log("reward/step", rr.Scalars(message.reward))
         self._stream.log("reward/return", rr.Scalars(message.episode_return))
+        if message.terminated or message.truncated:  # no instruction follows, which would show it
+            self._log_text()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        """Note which module each node runs."""
+        for status in message.status:
+            said = {value.key: value.value for value in status.values}
+            role = status.name.rpartition("/")[2]
+            if role in ROLES and MODULE in said:
+                who = " ".join(filter(None, (said[MODULE], Path(said.get(WEIGHTS, "")).name)))
+                self._shown = self._shown._replace(modules={**self._shown.modules, role: who})
+
+    def _log_text(self) -> None:
+        self._stream.log("now", rr.TextDocument(text(self._shown), media_type=rr.MediaType.MARKDOWN))
 
     def _on_image(self, entity: str, stamp: int, message: Image) -> None:
         frame = conversions.frame_from_msg(message, None)
@@ -177,62 +198,35 @@ class LiveNode(Node):
 
     def _on_grid(self, entity: str, stamp: int, message: AbstractState) -> None:
         state = conversions.abstract_state_from_msg(message)
-        self._stream.log(entity, rr.Image(grid_picture(state)))
+        self._stream.log(entity, rr.Image(grid_picture(state, CELL)))
         for channel, name in enumerate(CHANNELS):
             self._stream.log(f"{entity}/{name}", rr.DepthImage(state[..., channel], meter=1.0))
+        if entity == ESTIMATE:
+            row, column = np.unravel_index(int(np.argmax(state[..., AGENT])), state.shape[:2])
+            self._agent = (CELL * (float(column) + 0.5), CELL * (float(row) + 0.5))
 
     def _on_termination(self, stamp: int, message: Termination) -> None:
         self._stream.log("beta/probability", rr.Scalars(message.probability))
-        self._stream.log("beta/terminated", rr.Scalars(float(message.terminated)))
+        if message.terminated:
+            self._stream.log("beta/terminated", rr.Scalars(1.0))
 
     def _on_instruction(self, stamp: int, message: Instruction) -> None:
+        before = self._shown.instruction
+        self._shown = self._shown._replace(instruction=message)
         self._stream.log("instruction", rr.Scalars(message.direction))
-        if message.sequence != self._sequence:
-            self._sequence = message.sequence
+        if before is None or message.sequence != before.sequence:
             name = Direction(message.direction).name.lower()
             self._stream.log("instructions", rr.TextLog(f"{message.sequence}: {name}"))
+        elif stamp != self._pictured:
+            return
+        self._stream.log(f"{ESTIMATE}/instruction", arrow(self._agent, message.direction))
+        self._log_text()
 
     def _on_torque(self, stamp: int, message: JointState) -> None:
+        if not self._has_named_torques:
+            self._has_named_torques = True
+            self._stream.log("torque", torque_curves(len(message.effort)), static=True)
         self._stream.log("torque", rr.Scalars(np.array(message.effort)))
-
-
-def free_port(first: int) -> int:
-    """Return the first port from `first` on that nobody listens on.
-
-    Raises:
-        OSError: If there is none near.
-    """
-    for port in range(first, first + _PORTS):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("", port))
-            except OSError:
-                continue
-            return port
-    raise OSError(f"the ports from {first} to {first + _PORTS - 1} are all taken")
-
-
-def blueprint() -> rrb.Blueprint:
-    """Return the arrangement of the view."""
-    return rrb.Blueprint(
-        rrb.Vertical(
-            rrb.Horizontal(
-                rrb.Spatial2DView(origin="camera/first_person", name="first person"),
-                rrb.Spatial2DView(origin="camera/top_down", name="top down"),
-                rrb.Spatial2DView(origin="grid/estimate", contents=["grid/estimate"], name="estimate"),
-                rrb.Spatial2DView(origin="grid/ground_truth", contents=["grid/ground_truth"], name="truth"),
-            ),
-            rrb.Horizontal(
-                rrb.TimeSeriesView(origin="beta", name="beta"),
-                rrb.TimeSeriesView(origin="torque", name="torque"),
-                rrb.TimeSeriesView(origin="reward", name="reward"),
-                rrb.TimeSeriesView(origin="milliseconds", name="milliseconds"),
-                rrb.TextLogView(origin="instructions", name="instructions"),
-            ),
-        ),
-        collapse_panels=True,
-    )
 
 
 def main(args: Sequence[str] | None = None) -> int:

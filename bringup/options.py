@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 HERE = "here"
 """Stands for a cluster on this machine, which is started for the command."""
+LOOPBACK = "127.0.0.1"
+"""Where a view is served unless the user asks otherwise."""
 
 
 def _spec(metavar: str, read: Callable[[list[str]], Any], *, optional: bool = False) -> PrimitiveConstructorSpec[Any]:
@@ -75,8 +78,18 @@ def _address(given: list[str]) -> str:
     return given[0] if given else HERE
 
 
+def _interface(given: list[str]) -> str:
+    if not given:
+        return LOOPBACK
+    try:
+        return str(ip_address(" ".join(given)))
+    except ValueError:
+        raise ValueError(f"{' '.join(given)}, expected an IP address, such as {LOOPBACK} or 0.0.0.0") from None
+
+
 SPEED = _spec("[SPEED]", _speed, optional=True)
 ADDRESS = _spec("[ADDRESS]", _address, optional=True)
+INTERFACE = _spec("[ADDRESS]", _interface, optional=True)
 
 ModuleSource = Annotated[str, arg(metavar="WEIGHTS|MODULE:CLASS|NAME")]
 FilePath = Annotated[Path | None, arg(metavar="FILE")]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from mujoban_core.grid import CHANNELS, CONTROL_PERIOD, OFFSETS_RC, Instruction
+from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, OFFSETS_RC, TARGET, WALL, Instruction
 
 CELL: Final = 10
 """Pixels along the edge of a cell of the small map."""
@@ -18,8 +18,17 @@ MARGIN: Final = 8
 """Pixels from the corner of the picture to the map."""
 _FONT_SIZE: Final = 18
 _BACKGROUND: Final = 30.0
-_COLOURS: Final = np.array([[150, 140, 140], [200, 30, 30], [40, 90, 230], [230, 200, 30]], np.float32)
-"""RGB of the layers wall, target, agent, box."""
+COLOURS: Final = {
+    "wall": (150, 140, 140),
+    "target": (200, 30, 30),
+    "robot": (250, 250, 250),
+    "box": (230, 200, 30),
+    "box on a target": (40, 90, 230),
+}
+"""RGB of what a map shows; boxes and targets are as in the world."""
+_BOX_SIZE: Final = 0.7
+_ROBOT_SIZE: Final = 0.6
+"""Edge of a box and diameter of the robot in a map, of a cell: what they stand on shows around them."""
 
 
 class Said(NamedTuple):
@@ -34,12 +43,33 @@ class Said(NamedTuple):
     """Abstract state, probabilities [N, N, 4]."""
 
 
-def grid_picture(state: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return an abstract state, probabilities [N, N, 4], as colours, [N, N, 3]."""
-    canvas = np.full((*state.shape[:2], 3), _BACKGROUND, np.float32)
-    for channel in range(len(CHANNELS)):
-        weight = state[..., channel, None]
-        canvas = (1 - weight) * canvas + weight * _COLOURS[channel]
+def grid_picture(state: NDArray[np.float32], cell: int = CELL) -> NDArray[np.uint8]:
+    """Return an abstract state as a map in which all layers show, the more the surer they are.
+
+    Args:
+        state: Probabilities, [N, N, 4].
+        cell: Pixels along the edge of a cell.
+
+    Returns:
+        RGB, [N cell, N cell, 3].
+    """
+    large = np.repeat(np.repeat(state, cell, axis=0), cell, axis=1)[..., None]
+    across = np.abs((np.arange(cell) + 0.5) / cell - 0.5)
+    corner = np.maximum(across[:, None], across)
+    square, disc = 2 * corner <= _BOX_SIZE, 2 * np.hypot(across[:, None], across) <= _ROBOT_SIZE
+    box, agent = (
+        np.tile(shape, state.shape[:2])[..., None] * large[..., layer, :]
+        for shape, layer in ((square, BOX), (disc, AGENT))
+    )
+    canvas = np.full((*large.shape[:2], 3), _BACKGROUND, np.float32)
+    for name, weight in (
+        ("wall", large[..., WALL, :]),
+        ("target", large[..., TARGET, :]),
+        ("box", box),
+        ("box on a target", box * large[..., TARGET, :]),
+        ("robot", agent),
+    ):
+        canvas += weight * (np.array(COLOURS[name], np.float32) - canvas)
     return canvas.astype(np.uint8)
 
 
@@ -47,7 +77,7 @@ def draw(picture: NDArray[np.uint8], said: Said, step: int) -> NDArray[np.uint8]
     """Return the picture, [H, W, 3], with the estimate in its upper left corner and a line of text at the bottom."""
     image = Image.fromarray(picture)
     brush = ImageDraw.Draw(image)
-    cells = np.repeat(np.repeat(grid_picture(said.estimate), CELL, axis=0), CELL, axis=1)
+    cells = grid_picture(said.estimate)
     brush.rectangle((MARGIN - 2, MARGIN - 2, MARGIN + cells.shape[1] + 1, MARGIN + cells.shape[0] + 1), fill="white")
     image.paste(Image.fromarray(cells), (MARGIN, MARGIN))
     top = image.height - BAR

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 from tyro.conf import arg
 
 from bringup.command import import_from_here, recorded_seed
-from bringup.options import SPEED, Count, EpisodeOptions, FilePath, FolderPath, ModuleOptions
+from bringup.options import INTERFACE, SPEED, Count, EpisodeOptions, FilePath, FolderPath, ModuleOptions
 from mujoban_core.files import check_file, check_folder
 from mujoban_core.program import called, read_options, run_command
 
@@ -41,8 +41,10 @@ class Options:
     """Episodes in one file of the bag."""
     video: FilePath = None
     """Write an .mp4 of the robot's view and from above."""
-    view: bool = False
-    """Serve a live view (Rerun) to the browser."""
+    view: Annotated[str | None, INTERFACE] = None
+    """Serve a live view (Rerun) to the browser, on this machine alone or on the interface with this IP address
+    (0.0.0.0: all)."""
+
     json: FilePath = None
     """Write the report there."""
 

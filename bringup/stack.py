@@ -55,8 +55,8 @@ class PlayOptions:
     """Episodes in one file of the bag."""
     video: Path | None = None
     """Video file to write."""
-    view: bool = False
-    """Serve a live view to the browser, from a process of its own."""
+    view: str | None = None
+    """IP address on which a live view is served to the browser, from a process of its own."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,8 @@ def play(
             listeners.append(graph.add(_recorder(options.record, options, stack.body)))
         if options.video is not None:
             listeners.append(graph.add(VideoNode(options.video)))
-        if options.view:
-            exits.enter_context(viewer())
+        if options.view is not None:
+            exits.enter_context(viewer(options.view))
         if options.processes:
             processes = exits.enter_context(Processes(parameters))
             monitor.watch.ghosts = processes.ghosts
@@ -153,15 +153,18 @@ def _drain(executor: Executor, listeners: Sequence[RecorderNode | VideoNode], st
 
 
 @contextmanager
-def viewer() -> Iterator[None]:
+def viewer(address: str) -> Iterator[None]:
     """Run `bringup.live` in a process of its own: drawing must not hold up the graph.
+
+    Args:
+        address: IP address on which it is served.
 
     Raises:
         ValueError: If Rerun is not installed.
     """
     if find_spec("rerun") is None:
         raise ValueError("the live view needs rerun-sdk: pip install 'mujoban[view]'")
-    process = children.start([sys.executable, "-m", "bringup.live"])
+    process = children.start([sys.executable, "-m", "bringup.live", "--ros-args", "-p", f"address:='{address}'"])
     try:
         yield
     finally:

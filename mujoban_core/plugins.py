@@ -22,7 +22,7 @@ LEARNED: Final = "learned"
 ORACLE: Final = "oracle"
 
 PRIVILEGED: Final = " (privileged)"
-"""Ends the name of a class, other than an oracle, that receives the ground truth."""
+"""Ends the name of what receives the ground truth, other than an oracle."""
 
 GROUP: Final = "mujoban.modules"
 """The entry points' group."""

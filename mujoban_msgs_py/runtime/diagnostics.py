@@ -11,6 +11,10 @@ from rclpy.node import Node
 TOPIC: Final = "/diagnostics"
 PERIOD: Final = 1.0
 """Seconds between two messages."""
+MODULE: Final = "module"
+"""Names the figure that says which module a node runs; `mujoban_core.plugins.PRIVILEGED` ends it where that is so."""
+WEIGHTS: Final = "weights"
+"""Names the figure that says which weights a module has, other than those that ship."""
 
 
 class Condition(NamedTuple):

@@ -16,10 +16,11 @@ from rclpy.serialization import serialize_message
 
 from mujoban_core.interfaces import GroundTruth, Module, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
-from mujoban_core.plugins import LEARNED, load_module
+from mujoban_core.plugins import LEARNED, PRIVILEGED, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
+from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS, Condition
 from mujoban_msgs_py.runtime.kept import KeptArrays, leaves, with_leaves
 from mujoban_msgs_py.runtime.tick_node import Input, Output, TickNode
 from mujoban_msgs_py.topics import Topic
@@ -95,6 +96,12 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         if self._kept is not None:
             self._kept.read(self._resume)
         self.open_inputs([*self.inputs, *self._truth])
+
+    def _condition(self) -> Condition:
+        condition = super()._condition()
+        which = f"{self._source}{PRIVILEGED if self.module.privileged else ''}"
+        weights = self.get_parameter("weights").value
+        return condition._replace(values={MODULE: which, WEIGHTS: weights, **condition.values})
 
     @abstractmethod
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:

@@ -115,7 +115,8 @@ def test_every_node_says_on_diagnostics_how_it_is(play_graph):
     )
     graph.spin_until(lambda: len(heard) == len(NODES) and heard["/simulator"].message == "running")
     assert set(heard) == {f"/{name}" for name in NODES}
-    assert "dropped messages" in {value.key for value in heard["/planner"].values}
+    planner = {value.key: value.value for value in heard["/planner"].values}
+    assert "dropped messages" in planner and planner["module"] == "oracle (privileged)"
 
 
 def test_processes_that_are_killed_are_started_again(ros, oracles):

@@ -2,11 +2,17 @@
 
 import json
 import os
+import re
 import shutil
+import socket
 import subprocess
 import sys
+import time
 
 import pytest
+
+from bringup.run_stack import Options
+from mujoban_core.program import read_options
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (
@@ -118,6 +124,47 @@ def test_the_live_view_opens_in_chromium_and_asks_for_the_stream(page, live_view
     assert page.open(live_view, STARTED) == {"title": "Rerun Viewer", "panicked": False, "canvas": True}
     stream = live_view.split("/?url=")[1].removeprefix("rerun%2B").removesuffix("/proxy")
     page.await_request(stream)
+
+
+@pytest.mark.timeout(300)
+def test_the_live_view_is_served_on_this_machine_alone_and_ends_with_a_parent_that_is_killed():
+    pytest.importorskip("rerun")
+    code = (
+        "import time; from bringup.live_server import LiveServer; "
+        "server = LiveServer('127.0.0.1', 29776, 29790); print(server.page, flush=True); time.sleep(300)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    page = parent.stdout.readline()
+    web_port, grpc_port = (int(port) for port in re.findall(r"127\.0\.0\.1:(\d+)/", page))
+    elsewhere = "127.0.0.2"  # what listens on every interface listens there too
+    assert [takes("127.0.0.1", port) for port in (web_port, grpc_port)] == [True, True]
+    assert [takes(elsewhere, port) for port in (web_port, grpc_port)] == [False, False]
+    parent.kill()
+    parent.communicate()
+    deadline = time.monotonic() + 60
+    while takes("127.0.0.1", web_port):
+        assert time.monotonic() < deadline, "the server lives on"
+        time.sleep(0.05)
+
+
+def takes(address, port):
+    """Tell whether somebody listens."""
+    try:
+        socket.create_connection((address, port), timeout=5).close()
+    except ConnectionRefusedError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(("given", "address"), [([], "127.0.0.1"), (["0.0.0.0"], "0.0.0.0")])
+def test_the_view_is_served_where_it_is_asked_for(given, address):
+    options = read_options(Options, ["--view", *given], "run_stack.py")
+    assert options.view == address
+
+
+def test_an_address_that_is_none_is_named():
+    with pytest.raises(ValueError, match="--view everywhere, expected an IP address"):
+        read_options(Options, ["--view", "everywhere"], "run_stack.py")
 
 
 @pytest.mark.timeout(300)

@@ -3,24 +3,27 @@
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from mujoban_msgs.msg import EpisodeTruth, Instruction
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from visualization_msgs.msg import Marker, MarkerArray
 
-from bringup.overlay import BAR, CELL, MARGIN, grid_picture
+from bringup.overlay import BAR, CELL, COLOURS, MARGIN, grid_picture
 from bringup.video import EDGE, VideoNode
 from bringup.viz import VizNode, occupancy_grid
-from mujoban_core.grid import BOX, TARGET, WALL, cell_to_xy
+from mujoban_core.grid import AGENT, BOX, TARGET, WALL, cell_to_xy
 from mujoban_msgs_py import conversions, topics
 from mujoban_sim.observation import GLANCE
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.levels import Level
 
 LAYERS = ("wall", "target", "agent", "box")
 ENTITIES = {
     "/camera/first_person", "/camera/top_down", "/grid/estimate", "/grid/ground_truth",
     *(f"/grid/{source}/{layer}" for source in ("estimate", "ground_truth") for layer in LAYERS),
+    *(f"/grid/{source}/key" for source in ("estimate", "ground_truth")), "/grid/estimate/instruction", "/now",
     "/instruction", "/instructions", "/beta/probability", "/beta/terminated", "/torque", "/reward/step",
     "/reward/return",
     *(f"/milliseconds/{what}" for what in ("simulator", "estimator", "termination", "planner", "controller")),
@@ -73,6 +76,28 @@ def test_a_recording_of_the_live_view_holds_every_entity(play_graph, tmp_path):
     assert {part.entity_path for part in chunk.RrdReader(str(file)).stream()} >= ENTITIES
 
 
+def test_a_map_tells_robot_box_and_solved_box_apart_and_shows_the_target_below():
+    state = Level.from_text("######\n#+$*.#\n#   $#\n######\n").abstract_state()
+    picture = grid_picture(state, 16)
+    row, left = np.argwhere(state[..., AGENT])[0]
+    cells = [picture[16 * row : 16 * row + 16, 16 * c : 16 * c + 16].reshape(-1, 3) for c in range(left, left + 4)]
+    shown = [{name for name, colour in COLOURS.items() if (cell == colour).all(-1).any()} for cell in cells]
+    assert shown == [{"robot", "target"}, {"box"}, {"box on a target", "target"}, {"target"}]
+
+
+def test_the_live_view_names_instruction_and_modules_and_marks_those_that_are_told_the_truth():
+    pytest.importorskip("rerun")
+    from bringup.live_layout import Shown, text
+
+    truth = EpisodeTruth(episode=2, seed=7, difficulty=3, level="#@$.*#", step=40, boxes_on_target=1)
+    modules = {"planner": "oracle", "controller": "mine:Drive (privileged)", "estimator": "learned"}
+    shown = text(Shown(Instruction(sequence=4, direction=Instruction.WEST), truth, modules))
+    assert shown.startswith("# ← west\n")
+    for part in ("| 2: seed 7, difficulty 3 |", "| 2.0 s |", "| 1 of 2 boxes |", "| **oracle** |", "| learned |"):
+        assert part in shown
+    assert "| **mine:Drive (privileged)** |" in shown and "| termination | not heard yet |" in shown
+
+
 def test_a_video_shows_both_views_and_what_the_modules_say(play_graph, tmp_path):
     file = tmp_path / "film.mp4"
     episodes = Episodes(1, 0, difficulty=1)
@@ -84,9 +109,9 @@ def test_a_video_shows_both_views_and_what_the_modules_say(play_graph, tmp_path)
     frames = [np.asarray(frame) for frame in imageio.get_reader(file)]
     assert len(frames) == result.steps + 1, "one frame a tick, and one of the end"
     assert {frame.shape for frame in frames} == {(EDGE, 2 * EDGE, 3)}
-    middle = MARGIN + CELL // 2 + CELL * np.arange(10)
-    drawn = frames[0][middle[:, None], middle].astype(int)
-    estimate = grid_picture(episodes[0].level.abstract_state()).astype(int)
+    middle = CELL // 2 + CELL * np.arange(10)
+    drawn = frames[0][MARGIN + middle[:, None], MARGIN + middle].astype(int)
+    estimate = grid_picture(episodes[0].level.abstract_state())[middle[:, None], middle].astype(int)
     assert np.abs(drawn - estimate).max() < 60, "the map shows the estimate, but for what compression does to colours"
     line = frames[0][-BAR:, :EDGE]
     assert (line > 200).any() and (line < 40).any(), "the instruction is written at the bottom"
