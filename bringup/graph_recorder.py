@@ -66,8 +66,9 @@ class RecorderNode(Node):
 
     def destroy_node(self) -> None:
         """Write what is left and finish the bag."""
-        self._flush(before=None)
-        self._bag.close()
+        if not self._bag.closed:  # as it is where the disk was full
+            self._flush(before=None)
+            self._bag.close()
         super().destroy_node()
 
     def _receiver(self, name: str) -> Callable[[Received], None]:

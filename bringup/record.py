@@ -31,7 +31,7 @@ from mujoban_core import children
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_folder
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_core.program import called, read_options, run_command
+from mujoban_core.program import called, read_options, reason, run_command
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.signals import StopSignal, interrupt_status, interruptible, leave
 from mujoban_core.threads import set_threads
@@ -216,7 +216,7 @@ def _work(job: Job, answers: Connection) -> None:
             total = record(job, lambda ended: answers.send(_Answer(ended)))
         answers.send(_Answer(ticks=total))
     except (ValueError, OSError) as error:
-        answers.send(_Answer(error=str(error) or type(error).__name__))
+        answers.send(_Answer(error=reason(error)))
     except KeyboardInterrupt as error:
         leave(interrupt_status(error))
 

@@ -7,6 +7,7 @@ log time. Only the view from above is left out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -87,8 +88,9 @@ class Recorder:
 
     def close(self) -> None:
         """Close the bags."""
-        for row in self._rows.values():
-            row.writer.close()
+        with ExitStack() as closing:  # all of them, also where one fails
+            for row in self._rows.values():
+                closing.callback(row.writer.close)
 
     def write(self, tick: Tick) -> None:
         """Write one tick of every row in which an episode runs."""

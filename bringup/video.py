@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -28,6 +31,10 @@ PATIENCE: Final = 16
 
 _frame = partial(conversions.frame_from_msg, size=None)
 _SEEN: Final = {topics.CAMERA: _frame, topics.TOP_CAMERA: _frame, topics.EPISODE: conversions.episode_from_msg}
+_FRAGMENTS: Final = ["-movflags", "+frag_keyframe+empty_moov+default_base_moof", "-g", "100"]
+"""A film of parts of 5 s, each of which can be played without those after it: on a full disk it is shorter."""
+_FULL: Final = 1 << 20
+"""Bytes left on a disk below which a writer that fails has found it full."""
 _SAID: Final = {
     topics.INSTRUCTION: conversions.instruction_from_msg,
     topics.TERMINATION: conversions.termination_from_msg,
@@ -66,7 +73,9 @@ class VideoNode(Node):
             raise FileNotFoundError(f"{path}: no such folder {path.parent}")
         self._writer = imageio.get_writer(
             path, format="FFMPEG", fps=round(1 / CONTROL_PERIOD), codec="libx264", pixelformat="yuv420p",  # pyright: ignore
+            output_params=_FRAGMENTS,
         )  # fmt: skip
+        self._path, self._failed = path.absolute(), False
         self.written = 0
         self._waiting: dict[int, _Picture] = {}
         self._said: dict[int, Said] = {}
@@ -78,7 +87,8 @@ class VideoNode(Node):
 
     def destroy_node(self) -> None:
         """Finish the file."""
-        self._write(patience=0)
+        if not self._failed:
+            self._write(patience=0)
         self._writer.close()
         super().destroy_node()
 
@@ -121,7 +131,13 @@ class VideoNode(Node):
             pixels = picture.pixels
             if self._latest is not None:
                 pixels = np.concatenate([draw(pixels[:, :EDGE], self._latest, picture.step), pixels[:, EDGE:]], axis=1)
-            self._writer.append_data(pixels)
+            try:
+                self._writer.append_data(pixels)
+            except OSError as error:
+                self._failed = True
+                full = shutil.disk_usage(self._path.parent).free < _FULL
+                why = os.strerror(errno.ENOSPC) if full else str(error).split("\n")[0]
+                raise OSError(f"{self._path}: the video ends before step {picture.step}: {why}") from error
             self.written = stamp
 
 

@@ -101,7 +101,8 @@ class TerminationNode(ModuleNode[Termination]):
     def _on_instruction(self, message: Received) -> None:
         self._said[message.stamp] = message.content
         if len(self._said) > REMEMBERED:
-            del self._said[next(iter(self._said))]
+            # That of the tick before the next one is waited for, and was said once.
+            del self._said[next(stamp for stamp in self._said if stamp != self._handled)]
         self.retry()
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from mujoban_core.files import digest, replacing, write_atomically
+from mujoban_core.files import digest, naming, replacing, write_atomically
 from mujoban_rl.weights import check_finite
 
 _ANOTHER = "choose another directory"
+_SYSTEM_ERROR: Final = re.compile(r"\(os error (\d+)\)")
 
 
 class RunError(ValueError):
@@ -93,6 +96,7 @@ class RunDirectory:
 
         Raises:
             WeightsError: If a value is not finite; no file is written then.
+            OSError: If the disk is full or cannot be written to; the checkpoints before this one stay.
         """
         flat: dict[str, Tensor] = {}
         for name, module in modules.items():
@@ -108,10 +112,14 @@ class RunDirectory:
         json.dumps(content, allow_nan=False)  # before anything is written
         path = self.path / f"checkpoint-{step:010d}.safetensors"
         # Into a file and not into memory: a replay may take up most of that.
-        with replacing(path) as temporary:
-            save_file(flat, temporary)
+        with naming(path), replacing(path) as temporary:
+            _save(flat, temporary)
             content["digest"] = digest(temporary)
-        write_atomically(path.with_suffix(".json"), json.dumps(content).encode())
+        try:
+            write_atomically(path.with_suffix(".json"), json.dumps(content).encode())
+        except OSError:
+            path.unlink(missing_ok=True)  # without the other half it is none
+            raise
         for old in self._checkpoints()[self.keep :]:
             old.unlink(missing_ok=True)
             old.with_suffix(".json").unlink(missing_ok=True)
@@ -184,6 +192,16 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | N
         return (content, load_file(path)) if digest(path) == content["digest"] else None
     except (OSError, json.JSONDecodeError, KeyError, SafetensorError):
         return None
+
+
+def _save(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Write a safetensors file; an error of the system is one here as well, with its number."""
+    try:
+        save_file(dict(tensors), path)
+    except SafetensorError as error:
+        if (number := _SYSTEM_ERROR.search(str(error))) is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from error
 
 
 def _separate(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

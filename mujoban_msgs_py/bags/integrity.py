@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
+import tempfile
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -12,7 +15,7 @@ from mcap.exceptions import McapError
 from mcap.records import Chunk, Metadata
 from mcap.stream_reader import StreamReader
 
-from mujoban_core.files import digest
+from mujoban_core.files import digest, naming
 from mujoban_msgs_py.bags.errors import BagError
 
 IDENTITY: Final = "mujoban_bag"
@@ -31,11 +34,43 @@ class Identity(NamedTuple):
     """From 0."""
 
 
+class Reserve:
+    """Room on a disk, held by a file without a name until the disk is full: then what was begun can be finished.
+
+    Attributes:
+        full: The error of the disk when it was full, or None.
+    """
+
+    def __init__(self, folder: Path, size: int) -> None:
+        """Hold so many bytes.
+
+        Raises:
+            OSError: If there are not as many.
+        """
+        self.full: OSError | None = None
+        with naming(folder):
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # held for as long as the bag is open
+            os.posix_fallocate(self._file.fileno(), 0, size)
+
+    def released(self, error: OSError) -> bool:
+        """Give the room free if an error says that the disk is full; return whether it was held until now."""
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT) or self.full is not None:
+            return False
+        self.full = error
+        self.close()
+        return True
+
+    def close(self) -> None:
+        """Give the room free."""
+        self._file.close()
+
+
 class HashedFile:
     """A new file that knows its SHA-256; what is written has left the process, should it be killed."""
 
-    def __init__(self, path: Path) -> None:
-        """Make the file."""
+    def __init__(self, path: Path, reserve: Reserve) -> None:
+        """Make the file; `reserve` is used up where the disk is full."""
+        self._reserve = reserve
         self._file = path.open("xb", buffering=0)
         self._hash = hashlib.sha256()
 
@@ -51,7 +86,11 @@ class HashedFile:
         view = memoryview(data).cast("B")
         done = 0
         while done < len(view):
-            done += self._file.write(view[done:]) or 0
+            try:
+                done += self._file.write(view[done:]) or 0
+            except OSError as error:
+                if not self._reserve.released(error):
+                    raise
         self._hash.update(view)
         return done
 

@@ -11,7 +11,7 @@ from typing import Any, Final, Self
 from mcap.writer import CompressionType, Writer
 
 from mujoban_msgs_py.bags.errors import BagError
-from mujoban_msgs_py.bags.integrity import IDENTITY, LAST, HashedFile, Identity, dump_identity
+from mujoban_msgs_py.bags.integrity import IDENTITY, LAST, HashedFile, Identity, Reserve, dump_identity
 from mujoban_msgs_py.bags.metadata import FileRecord, Metadata, TopicRecord, dump_qos, qos_profile
 from mujoban_msgs_py.bags.types import TypeRegistry
 from mujoban_msgs_py.topics import Topic
@@ -21,6 +21,8 @@ CHUNK_SIZE: Final = 1 << 20
 FLUSH_AFTER: Final = 8
 """`BagWriter.flush_after` of what records the graph: ticks that a recorder loses at most when it is killed."""
 PROFILE: Final = "ros2"
+_SUMMARY: Final = 1 << 18
+"""Bytes that the end of a file and metadata.yaml take at most; they and a chunk find room on a full disk."""
 
 _COMPRESSION: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 
@@ -28,8 +30,9 @@ _COMPRESSION: Final = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zs
 class BagWriter:
     """A bag of MCAP files with chunk and file checksums, and one file per so many episodes.
 
-    metadata.yaml exists from the first message on. Of a writer that is killed all whole chunks can be read:
-    see `open_bag` and `recover_bag`.
+    metadata.yaml exists from the first message on. Of a writer that is killed all whole chunks can be read: see
+    `open_bag` and `recover_bag`. Where the disk is full, the bag is finished with all that was written, in room that is
+    held for that.
     """
 
     def __init__(
@@ -81,10 +84,20 @@ class BagWriter:
             self.path.mkdir(parents=True)
         except FileExistsError:
             raise BagError(f"{self.path} exists already: a bag needs a new folder") from None
+        try:
+            self._reserve = Reserve(self.path, chunk_size + _SUMMARY)
+        except OSError:
+            self.path.rmdir()
+            raise
         self._open_file()
         for topic in topics:
             self._add(topic.name, topic.type_name, [qos_profile(latched=topic.latched)])
-        self._metadata.write(self.path)
+        self._write_metadata()
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing more can be written."""
+        return self._stream is None
 
     @property
     def counts(self) -> dict[str, int]:
@@ -99,7 +112,7 @@ class BagWriter:
         """
         if name not in self._metadata.topics:
             self._add(name, type_name, qos)
-            self._metadata.write(self.path)
+            self._write_metadata()
         elif self._metadata.topics[name].type_name != type_name:
             known = self._metadata.topics[name].type_name
             raise BagError(f"topic {name} of {self.path} is of type {known}, not {type_name}")
@@ -121,6 +134,7 @@ class BagWriter:
 
         Raises:
             BagError: If the topic is unknown or the bag is closed.
+            OSError: If the disk is full; the bag is closed, with this message in it.
         """
         channel = self._channels.get(topic)
         if channel is None or self._stream is None:
@@ -138,6 +152,9 @@ class BagWriter:
             self._stamps.add(stamp)
             if len(self._stamps) > self._flush_after:
                 self.flush()
+        if (full := self._reserve.full) is not None:
+            self.close()
+            raise OSError(full.errno, full.strerror, str(self.path))
 
     def end_episode(self) -> None:
         """Note that an episode is complete; after `episodes_per_file` of them a new file is begun."""
@@ -161,7 +178,8 @@ class BagWriter:
             return
         self._writer.add_metadata(LAST, {})
         self._close_file()
-        self._metadata.write(self.path)
+        self._write_metadata()
+        self._reserve.close()
 
     def __enter__(self) -> Self:
         return self
@@ -173,7 +191,7 @@ class BagWriter:
 
     def _open_file(self) -> None:
         file = FileRecord(f"{self.path.name}_{len(self._metadata.files)}.mcap")
-        self._stream, self._is_split = HashedFile(self.path / file.path), False
+        self._stream, self._is_split = HashedFile(self.path / file.path, self._reserve), False
         self._writer = Writer(
             self._stream,  # pyright: ignore[reportArgumentType]  # what it calls
             chunk_size=self._chunk_size,
@@ -188,7 +206,15 @@ class BagWriter:
         self._metadata.files.append(file)
         for topic in self._metadata.topics.values():
             self._register(topic)
-        self._metadata.write(self.path)
+        self._write_metadata()
+
+    def _write_metadata(self) -> None:
+        try:
+            self._metadata.write(self.path)
+        except OSError as error:
+            if not self._reserve.released(error):
+                raise
+            self._metadata.write(self.path)
 
     def _close_file(self) -> None:
         assert self._stream is not None

@@ -14,6 +14,7 @@ from bringup.monitor import ANOTHER_RUN
 from bringup.viz import VizNode
 from mujoban_msgs_py import conversions, listening, topics
 from mujoban_msgs_py.bags import open_bag
+from mujoban_msgs_py.listening import Received
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import generate_level
 
@@ -156,6 +157,16 @@ def test_messages_that_are_no_messages_are_named_by_topic(play_graph, capfd):
     graph.spin_until(lambda: graph.monitor.counts["rejected messages"] == 2)
     assert graph.finish()[0].solved
     assert "rejected a message on /instruction: direction must be one of 0 (STAY)" in capfd.readouterr().err
+
+
+def test_a_flood_of_instructions_does_not_wash_away_the_one_that_is_waited_for(play_graph):
+    graph = play_graph(names=["termination"])
+    termination = graph.graph.nodes["termination"]
+    termination._handled = 3 * topics.TICK
+    for stamp in (3, *range(10, 200)):
+        termination._on_instruction(Received(stamp * topics.TICK, conversions.InstructionReading(1, 2), b""))
+    assert termination._previous(4 * topics.TICK) == conversions.InstructionReading(1, 2)
+    assert 3 * topics.TICK in termination._said and len(termination._said) < 100
 
 
 def test_every_topic_is_attacked():

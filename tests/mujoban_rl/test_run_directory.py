@@ -1,10 +1,13 @@
+import errno
 import json
 
 import pytest
 import torch
+from safetensors import SafetensorError
 from torch import nn
 
 from mujoban_core.stats import wilson_interval
+from mujoban_rl import run_directory
 from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.run_directory import RunDirectory, RunError
 from mujoban_rl.training_log import TrainingLog
@@ -40,6 +43,26 @@ def test_resumed_training_equals_uninterrupted_training(tmp_path):
     _fit(net, adam, 3)
     _fit(again, adam2, 3)
     assert torch.equal(net.layer.weight, again.layer.weight)
+
+
+@pytest.mark.parametrize("part", ["safetensors", "json"])
+def test_a_checkpoint_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path, monkeypatch, part):
+    net, adam = _make()
+    run = RunDirectory(tmp_path, {})
+    run.save(1, modules={"net": net}, optimisers={"adam": adam})
+    before = sorted(file.name for file in tmp_path.iterdir())
+
+    def full(*_):
+        if part == "safetensors":
+            raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+        raise OSError(errno.ENOSPC, "No space left on device", "checkpoint-0000000002.json")
+
+    monkeypatch.setattr(run_directory, "save_file" if part == "safetensors" else "write_atomically", full)
+    with pytest.raises(OSError, match=rf"No space left on device: .*checkpoint-0000000002\.{part}"):
+        run.save(2, modules={"net": net}, optimisers={"adam": adam})
+    assert sorted(file.name for file in tmp_path.iterdir()) == before
+    snapshot = run.load(modules={"net": net}, optimisers={"adam": adam})
+    assert snapshot is not None and snapshot.step == 1
 
 
 def test_moments_come_back_in_the_layout_of_their_parameters_which_fused_optimisers_rely_on(tmp_path):
