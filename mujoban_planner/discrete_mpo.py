@@ -170,7 +170,7 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
         config, batch = self.config, batch.to(self.device)
         with torch.no_grad(), self._autocast():
             before, after = self._answers(self.target, batch.state), self._answers(self.target, batch.last)
-        target = batch.reward + batch.bootstrap * expected_value(after.q, after.policy)
+        target = batch.reward + batch.bootstrap * self.value(after)
         with self._autocast():
             output = self._answers(self.network, batch.state)
         policy_loss, stats = self.mpo(output.policy, before.policy, before.q)
@@ -182,6 +182,10 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
         if self._updates % config.target_period == 0:
             self.target.load_state_dict(self.network.state_dict())
         return {"q_loss": q_loss.item(), "mean_reward": batch.reward.mean().item()} | scalars(stats._asdict())
+
+    def value(self, answer: Answer) -> Tensor:
+        """Return what states are worth, [B]."""
+        return expected_value(answer.q, answer.policy)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16)

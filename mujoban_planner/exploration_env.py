@@ -22,9 +22,6 @@ from mujoban_core.visibility import cells_in_view
 from mujoban_planner.uncertainty import BORDER, guesses, visible
 from mujoban_rl.engine import State
 
-DONE: Final = len(Instruction)
-"""The action behind the instructions: there is nothing more to look for."""
-ACTIONS: Final = DONE + 1
 SHOWN: Final = 4
 """Channel of the cells that looks have shown, behind those of the abstract state."""
 CHANNELS: Final = SHOWN + 1
@@ -49,8 +46,8 @@ class ExplorationStep(NamedTuple):
     """Outcome of an action, [E] each."""
 
     reward: NDArray[np.float32]
-    done: NDArray[np.bool_]
-    """Whether the robot has ended the exploration."""
+    complete: NDArray[np.bool_]
+    """Whether all that can be seen was seen: the episode terminated."""
     truncated: NDArray[np.bool_]
     """Whether its instructions were used up."""
 
@@ -59,7 +56,8 @@ class ExplorationEnvironment:
     """E levels that are explored.
 
     Observation: estimate and cells that looks have shown, float32 [E, N, N, 5]. Action: STAY (a turn on the spot), a
-    step north, east, south or west, or `DONE`. Reward: see `ExplorationReward`. Every episode begins with a turn.
+    step north, east, south or west. Reward: see `ExplorationReward`. Every episode begins with a turn. To stop is worth
+    nothing and needs no action: whoever expects less of every action stops.
     """
 
     def __init__(
@@ -121,21 +119,19 @@ class ExplorationEnvironment:
     def step(self, action: NDArray[np.int64]) -> ExplorationStep:
         """Execute an action in every level, [E]."""
         before, config = self.seen.sum((1, 2)), self._reward
-        moves = (action > 0) & (action < DONE)
-        ahead = self.agent + OFFSETS_RC[np.where(moves, action, 0)]
+        moves = action != Instruction.STAY
+        ahead = self.agent + OFFSETS_RC[action]
         row, column = ahead.T
         every = np.arange(len(action))
         blocked = self.level[every, row, column, WALL] | self.level[every, row, column, BOX]
         self.agent = np.where((moves & ~blocked)[:, None], ahead, self.agent)
-        walked, looked = np.flatnonzero(moves), np.flatnonzero(action == Instruction.STAY)
+        walked, looked = np.flatnonzero(moves), np.flatnonzero(~moves)
         self.seen[walked] |= self._view(walked, _HEADINGS[action[walked]])
         self._look(looked)
         self.steps += 1
-        cost = np.where(moves, config.move, 0.0) + np.where(action == Instruction.STAY, config.look, 0.0)
-        reward = config.cell * (self.seen.sum((1, 2)) - before) - cost
-        done = action == DONE
-        truncated = ~done & (self.steps >= WALKS)
-        return ExplorationStep(reward.astype(np.float32), done, truncated)
+        reward = config.cell * (self.seen.sum((1, 2)) - before) - np.where(moves, config.move, config.look)
+        complete = self.remaining == 0
+        return ExplorationStep(reward.astype(np.float32), complete, ~complete & (self.steps >= WALKS))
 
     def state(self) -> State:
         """Return all that changes, levels included."""

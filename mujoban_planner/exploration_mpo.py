@@ -13,16 +13,18 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
 from mujoban_core.grid import Instruction
 from mujoban_core.look_around import Scout, ScriptedScout
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch, StepStore
-from mujoban_planner.exploration_env import DONE, SHOWN, ExplorationEnvironment, ExplorationReward
+from mujoban_planner.discrete_mpo import Answer, DiscreteMPOLearner, MPOBatch, StepStore
+from mujoban_planner.exploration_env import SHOWN, ExplorationEnvironment, ExplorationReward
 from mujoban_planner.explorer import Explorer
 from mujoban_planner.moves import LevelStream, PlayConfig
+from mujoban_planner.symmetry import SYMMETRIES, view_states
 from mujoban_planner.validation import difficulty_shares, validation_levels
 from mujoban_rl.actors import Actor, ActorOptions, ActorSource, Experience
 from mujoban_rl.engine import Budget, Cadence, State, Trainer
@@ -45,9 +47,13 @@ class ExplorerConfig(PlayConfig):
     blocks: int = 4
     reward: ExplorationReward = field(default_factory=ExplorationReward)
     environments: int = 128
+    levels: int = 4096
+    """Levels of each actor, of which every episode takes one under one of eight symmetries."""
+    steps_per_update: float = 0.25
     mpo: DiscreteMPOConfig = field(
         default_factory=lambda: DiscreteMPOConfig(epsilon_policy=0.01, initial_temperature=0.3, initial_alpha=1.0)
     )
+    n_step: int = 3
     replay_steps: int = 300
     discount: float = 0.97
     learning_rate: float = 1e-3
@@ -64,12 +70,18 @@ class ExplorerActor(Actor):
     def __init__(self, config: ExplorerConfig, network: Mapping[str, Any], stream: int) -> None:
         """Begin E levels; `stream` is the number of the random stream."""
         self._config, self._explorer = config, Explorer(**network).eval()
-        self._levels = LevelStream(difficulty_shares(config.mix), config.seed, stream)
+        stream_of_levels = LevelStream(difficulty_shares(config.mix), config.seed, stream)
+        self._pool = stream_of_levels.draw(config.levels)
         rng = np.random.default_rng([config.seed, _STREAM, stream])
-        first = self._levels.draw(config.environments).numpy()
-        self._environment = ExplorationEnvironment(first, rng, config.reward)
         self._generator = torch.Generator().manual_seed(int(rng.integers(1 << 31)))
+        self._environment = ExplorationEnvironment(self._draw(config.environments), rng, config.reward)
         self._builder = SequenceBuilder(config.play + config.n_step, config.n_step)
+
+    def _draw(self, count: int) -> NDArray[np.float32]:
+        """Return random levels of the pool under random symmetries, [count, N, N, 4]."""
+        rows = torch.randint(len(self._pool), (count,), generator=self._generator)
+        symmetries = torch.randint(SYMMETRIES, (count, 1), generator=self._generator)
+        return view_states(self._pool[rows], symmetries).numpy()
 
     def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
         """Explore with these weights."""
@@ -87,24 +99,23 @@ class ExplorerActor(Actor):
             chances = functional.softmax(policy.float(), 1)
             action = torch.multinomial(chances, 1, generator=self._generator)[:, 0].numpy()
             step = self._environment.step(action)
-            over = np.flatnonzero(step.done | step.truncated)
-            self._environment.begin(over, self._levels.draw(len(over)).numpy())
+            over = np.flatnonzero(step.complete | step.truncated)
+            self._environment.begin(over, self._draw(len(over)))
             steps += len(action)
             rewards += step.reward.tolist()
             kept = {"state": state.astype(np.float16), "instruction": action, "reward": step.reward}
-            sequence = self._builder.add({**kept, "terminated": step.done, "dropped": step.truncated})
+            sequence = self._builder.add({**kept, "terminated": step.complete, "dropped": step.truncated})
         return Experience(sequence, steps, {"reward": np.array(rewards)})
 
     def state(self) -> State:
         """Return all that changes but the weights."""
         own = State(tensors={"generator": self._generator.get_state()})
-        parts = {"levels": self._levels, "environment": self._environment, "builder": self._builder}
+        parts = {"environment": self._environment, "builder": self._builder}
         return State.of({"own": own} | {name: part.state() for name, part in parts.items()})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         self._generator.set_state(state.part("own").tensors["generator"])
-        self._levels.restore(state.part("levels"))
         self._environment.restore(state.part("environment"))
         self._builder.restore(state.part("builder"))
 
@@ -120,19 +131,23 @@ def judge_scout(
     states = abstract_states(validation_levels(difficulty, levels))
     environment = ExplorationEnvironment(states, np.random.default_rng(0), reward)
     hidden, going = environment.remaining, np.ones(levels, np.bool_)
+    left = hidden.copy()
     steps, looks, returns = np.zeros(levels), np.zeros(levels), np.zeros(levels)
     while going.any():
-        action = np.full(levels, DONE)
+        action = np.zeros(levels, np.int64)
         observed = environment.observe()
         for i in np.flatnonzero(going):
             answer = scout.step(observed[i, ..., :SHOWN], observed[i, ..., SHOWN] > 0.5)
-            action[i] = DONE if answer is None else int(answer)
+            going[i] = answer is not None
+            action[i] = answer or Instruction.STAY
+        # Those who have stopped turn where they are, which does not count.
         step = environment.step(action)
-        looks += action == Instruction.STAY
-        steps += (action != Instruction.STAY) & (action != DONE)
-        returns += step.reward
-        going &= ~(step.done | step.truncated)
-    found = 1.0 - environment.remaining.sum() / max(int(hidden.sum()), 1)
+        looks += going & (action == Instruction.STAY)
+        steps += going & (action != Instruction.STAY)
+        returns += np.where(going, step.reward, 0.0)
+        left = np.where(going, environment.remaining, left)
+        going &= ~step.truncated
+    found = 1.0 - left.sum() / max(int(hidden.sum()), 1)
     means = {"steps": steps.mean(), "looks": looks.mean(), "reward": returns.mean()}
     return {"found": float(found)} | {name: float(value) for name, value in means.items()}
 
@@ -147,6 +162,10 @@ class ExplorerLearner(DiscreteMPOLearner):
         torch.manual_seed(config.seed)  # the initial weights
         super().__init__(config, Explorer(config.channels, config.blocks))
         self._reward = config.reward
+
+    def value(self, answer: Answer) -> Tensor:
+        """Return what states are worth to one who may stop, [B]."""
+        return super().value(answer).clamp(min=0.0)
 
     def evaluate(self) -> dict[str, float]:
         """Return what the target network gets to see of validation levels, and what the scripted scout does."""

@@ -2,7 +2,7 @@
 
 It says a step towards a view, a turn on the spot, or that there is nothing more to look for; it pushes nothing.
 
-Shapes: B states, N = `grid.GRID_SIZE`, I = 8 rows and columns of the interior, C channels, A = 6 actions.
+Shapes: B states, N = `grid.GRID_SIZE`, I = 8 rows and columns of the interior, C channels, A = 5 instructions.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
 from mujoban_core.look_around import FREE, Scout
-from mujoban_planner.exploration_env import ACTIONS, CHANNELS, DONE, SHOWN
+from mujoban_planner.exploration_env import CHANNELS, SHOWN
 from mujoban_planner.networks import ResidualBlock
 from mujoban_rl.weights import load_weights
 
@@ -34,9 +34,9 @@ class ExplorerOutput(NamedTuple):
     """What the network says about states."""
 
     policy: Tensor
-    """Logits of the actions, [B, A]."""
+    """Logits of the instructions, [B, A]; STAY is a turn on the spot."""
     q: Tensor
-    """[B, A]."""
+    """What each brings to see, less what it and all that follows it cost, [B, A]."""
 
 
 class Explorer(nn.Module, Scout):
@@ -51,8 +51,8 @@ class Explorer(nn.Module, Scout):
         self.encoder = nn.Conv2d(CHANNELS, channels, 3, padding=1)
         self.blocks = nn.Sequential(*(ResidualBlock(channels) for _ in range(blocks)))
         self.mix = nn.Linear(3 * channels, 2 * channels)
-        self.policy = nn.Linear(2 * channels, ACTIONS)
-        self.q = nn.Linear(2 * channels, ACTIONS)
+        self.policy = nn.Linear(2 * channels, len(Instruction))
+        self.q = nn.Linear(2 * channels, len(Instruction))
         offsets = OFFSETS_RC[:, 0] * GRID_SIZE + OFFSETS_RC[:, 1]
         self.register_buffer("offsets", torch.from_numpy(offsets[1:].copy()), persistent=False)
 
@@ -66,21 +66,21 @@ class Explorer(nn.Module, Scout):
         return ExplorerOutput(policy, self.q(features))
 
     def possible(self, states: Tensor) -> Tensor:
-        """Return which actions there are: no steps into walls, boxes or the border, bool [B, A]."""
+        """Return which instructions there are: no steps into walls, boxes or the border, bool [B, A]."""
         free = (states[..., WALL] < FREE) & (states[..., BOX] < FREE)
         free[:, [0, -1]] = free[:, :, [0, -1]] = False
         at = states[..., AGENT].flatten(1).argmax(1)
         moves = free.flatten(1).gather(1, (at[:, None] + self.offsets).clamp(0, GRID_SIZE**2 - 1))
-        always = torch.ones_like(moves[:, :1])
-        return torch.cat([always, moves, always], 1)
+        return torch.cat([torch.ones_like(moves[:, :1]), moves], 1)
 
     @torch.inference_mode()
     def step(self, abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> Instruction | None:
-        """Return the likeliest action; see `Scout.step`."""
+        """Return the likeliest instruction, None where it is not worth its cost; see `Scout.step`."""
         state = np.concatenate([abstract_state, shown[..., None]], -1).astype(np.float32)
         assert state.shape[-1] == SHOWN + 1
-        action = int(self(torch.from_numpy(state)[None]).policy.argmax())
-        return None if action == DONE else Instruction(action)
+        policy, q = self(torch.from_numpy(state)[None])
+        best = int(policy.argmax())
+        return Instruction(best) if q[0, best] > 0.0 else None
 
 
 def load(path: str | Path | None = None, device: str = "cpu") -> Explorer:

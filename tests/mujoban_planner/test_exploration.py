@@ -9,7 +9,7 @@ import torch
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
 from mujoban_core.look_around import LookAroundPlanner, Scout
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.exploration_env import DONE, SHOWN, ExplorationEnvironment, ExplorationReward
+from mujoban_planner.exploration_env import SHOWN, ExplorationEnvironment, ExplorationReward
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore, judge_scout
 from mujoban_planner.explorer import Explorer
 from mujoban_planner.uncertainty import visible
@@ -56,23 +56,24 @@ def test_cells_that_come_into_view_are_rewarded_once_and_steps_cost(environment)
     before = environment.seen.sum()
     gained.append(float(environment.step(stay).reward[0]))
     assert gained[-1] == environment.seen.sum() - before - 0.5 > 0
-    assert environment.shown[0, 1, 5] and environment.step(stay).reward == -0.5
-    end = environment.step(np.array([DONE]))
-    assert end.done and end.reward == 0.0
+    last = environment.step(stay)
+    assert environment.shown[0, 1, 5] and last.reward == -0.5
+    assert bool(last.complete[0]) == (environment.remaining[0] == 0)
 
 
 def test_an_explorer_steps_only_where_it_believes_the_way_is_free(environment):
     torch.manual_seed(0)
     explorer = Explorer(8, 1)
     state = torch.from_numpy(environment.observe())
-    assert explorer.possible(state)[0].tolist() == [True, False, True, False, False, True]
+    assert explorer.possible(state)[0].tolist() == [True, False, True, False, False]
     with torch.no_grad():
         explorer.policy.bias[int(Instruction.SOUTH)] = 100.0
         explorer.policy.bias[int(Instruction.EAST)] = 50.0
+        explorer.q.bias[int(Instruction.EAST)] = 50.0
     seen = environment.observe()[0]
     assert explorer.step(seen[..., :SHOWN], seen[..., SHOWN] > 0.5) == Instruction.EAST
     with torch.no_grad():
-        explorer.policy.bias[DONE] = 1000.0
+        explorer.q.bias[int(Instruction.EAST)] = -50.0
     assert explorer.step(seen[..., :SHOWN], seen[..., SHOWN] > 0.5) is None
 
 
@@ -95,6 +96,7 @@ def test_a_planner_looks_where_its_scout_says(environment):
 def small(path, **changes):
     config = ExplorerConfig(
         channels=8, blocks=1, environments=8, batch_size=16, warm_up_steps=15, replay_steps=60, play=5, n_step=3,
+        levels=16,
         **changes,
     )  # fmt: skip
     return explore(config, path)
