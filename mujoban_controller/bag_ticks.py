@@ -122,6 +122,7 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
         "action": np.take_along_axis(applied, order, 1)[:-1],
         "reward": rule.after(view.at(now + 1, now), there, change, ended & completed[1:], failed),
         "discount": discount,
+        "truncated": (discount == 0.0) & ~failed,
         "goal": goal_offsets(view)[:-1],
         "kind": goals.kind[:-1].copy(),
     }

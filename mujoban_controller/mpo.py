@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -57,7 +58,10 @@ class MPOTrainingConfig:
     critic_rate: float = 3e-4
     clip: float = 40.0
     critic_first: int = 0
-    """Updates in which the critic learns alone; a policy that is good already needs it."""
+    """Updates in which the critic learns alone, of what was played; a policy that is good already needs it."""
+    explore: float = 0.0
+    """Least standard deviation of the torques of every third robot: without it a policy that is sure of itself shows
+    the critic nothing else."""
     normalised: int = 2_000
     """Updates after which the normalisation of features stays as it is."""
     loss: MPOConfig = field(default_factory=MPOConfig)
@@ -73,6 +77,17 @@ class MPOTrainingConfig:
             raise ValueError(f"sequence {self.sequence}: expected at least the ticks of a window, {self.window}")
         if self.window <= self.n_step:
             raise ValueError(f"window {self.window}: expected more ticks than n_step {self.n_step}")
+
+
+class _Draws(NamedTuple):
+    """What the E-step weighs."""
+
+    target: Gaussian
+    """[M, W - n, U]."""
+    action: Tensor
+    """[N, M, W - n, U]."""
+    q: Tensor
+    """[N, M, W - n]."""
 
 
 class MPOLearner(ProductLearner[Batch]):
@@ -132,17 +147,12 @@ class MPOLearner(ProductLearner[Batch]):
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one step of the critic, and one of the policy unless the batch was refused."""
         config = self.config
-        with torch.no_grad():
-            target = self.target_policy.over_windows(batch, config.n_step)
-            noise = torch.randn((config.samples, *target.mean.shape), generator=self._generator)
-            # Shapes [N, M, W - n, U] and [N, M, W - n].
-            action = target.mean + target.scale * noise
-            q = self.target_critic(batch["features"][:, config.n_step :], self._as_seen(action, batch))
-        loss = self._critic_loss(batch, q.mean(0))
+        draws = None if self._updates < config.critic_first else self._draw(batch)
+        loss = self._critic_loss(batch, self._value_of_play(batch) if draws is None else draws.q.mean(0))
         stats = {"loss/critic": float(loss.detach())}
         accepted = guarded_step(loss, [self._critic_adam], guard, clip=config.clip) is not None
-        if accepted and self._updates >= config.critic_first:
-            stats |= self._update_policy(batch, target, action, q, guard)
+        if accepted and draws is not None:
+            stats |= self._update_policy(batch, draws, guard)
         if accepted and self._updates < config.normalised:
             self._normalise(batch)
         self._updates += accepted
@@ -150,6 +160,22 @@ class MPOLearner(ProductLearner[Batch]):
             self.target_policy.load_state_dict(self.policy.state_dict())
             self.target_critic.load_state_dict(self.critic.state_dict())
         return stats
+
+    @torch.no_grad()
+    def _draw(self, batch: Batch) -> _Draws:
+        """Return actions of the target policy in the last W - n ticks, with their values."""
+        config = self.config
+        target = self.target_policy.over_windows(batch, config.n_step)
+        noise = torch.randn((config.samples, *target.mean.shape), generator=self._generator)
+        action = target.mean + target.scale * noise
+        q = self.target_critic(batch["features"][:, config.n_step :], self._as_seen(action, batch))
+        return _Draws(target, action, q)
+
+    @torch.no_grad()
+    def _value_of_play(self, batch: Batch) -> Tensor:
+        """Return the values of what was done in the last W - n ticks, [M, W - n]."""
+        n = self.config.n_step
+        return self.target_critic(batch["features"][:, n:], batch["action"][:, n:])
 
     def _normalise(self, batch: Mapping[str, Tensor]) -> None:
         """Take in what is seen, for online and target networks alike: what they compute would differ otherwise."""
@@ -170,14 +196,17 @@ class MPOLearner(ProductLearner[Batch]):
         n = self.config.n_step
         starts = value.shape[1]
         # Shape [M * (W - n), n].
-        reward, discount = (batch[k].unfold(1, n, 1)[:, :starts].flatten(0, 1) for k in ("reward", "discount"))
+        reward, discount, truncated = (
+            batch[k].unfold(1, n, 1)[:, :starts].flatten(0, 1) for k in ("reward", "discount", "truncated")
+        )
         target = td_target(reward, discount, value.flatten(), self.config.gamma)
         predicted = self.critic(batch["features"][:, :starts], batch["action"][:, :starts]).flatten()
-        return functional.mse_loss(predicted, target)
+        # Nobody knows what would have come after an episode that was cut off.
+        known = ~truncated.any(1)
+        return (functional.mse_loss(predicted, target, reduction="none") * known).sum() / known.sum().clamp(min=1)
 
-    def _update_policy(
-        self, batch: Batch, target: Gaussian, action: Tensor, q: Tensor, guard: NaNGuard
-    ) -> dict[str, float]:
+    def _update_policy(self, batch: Batch, draws: _Draws, guard: NaNGuard) -> dict[str, float]:
+        target, action, q = draws
         online = self.policy.over_windows(batch, self.config.n_step)
         loss, stats = self.loss(
             (online.mean.flatten(0, 1), online.scale.flatten(0, 1)),

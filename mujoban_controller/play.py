@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_controller.controller import INPUT_FIELDS, MEMORY_FIELDS, Recurrent, VisuomotorController
-from mujoban_controller.goal_task import GoalTask, Outcome
+from mujoban_controller.goal_task import GoalTask, Outcome, TaskStep
 from mujoban_controller.judge import OutcomeSummary
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_core.interfaces import ControllerInput, Memory, renew_rows
@@ -24,6 +24,10 @@ from mujoban_rl.replay import SequenceBuilder, SequenceReplay
 
 Fields = dict[str, NDArray]
 Batch = dict[str, Tensor]
+
+
+def _outcome(step: TaskStep) -> Fields:
+    return {"reward": step.reward, "discount": step.discount, "truncated": step.truncated}
 
 
 class Player(ABC):
@@ -84,7 +88,7 @@ class PrivilegedPlayer(TaskPlayer):
         action = self._policy(torch.from_numpy(features)).sample(self._generator).clamp(-1.0, 1.0).numpy()
         result = self.task.step(self.task.torque_of(action))
         self._features = self.task.features()
-        kept = {"features": features, "action": action, "reward": result.reward, "discount": result.discount}
+        kept = {"features": features, "action": action, **_outcome(result)}
         return kept, result.outcomes
 
     def take(self, weights: Mapping[str, Tensor]) -> None:
@@ -130,7 +134,7 @@ class CameraPlayer(TaskPlayer):
         kept |= {name: m.numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
         torque, extra = self._act(inputs, output.action.mean[:, 0], output.action.scale[:, 0])
         result = task.step(torque)
-        kept |= {"first": first, **extra, "reward": result.reward, "discount": result.discount}
+        kept |= {"first": first, **extra, **_outcome(result)}
         return kept, result.outcomes
 
     @abstractmethod
@@ -158,10 +162,18 @@ class CameraPlayer(TaskPlayer):
 class ExploringPlayer(CameraPlayer):
     """A camera policy that draws its torques, for MPO with an asymmetric critic."""
 
+    def __init__(
+        self, task: GoalTask, policy: VisuomotorController, generator: torch.Generator, explore: float = 0.0
+    ) -> None:
+        """Play with a copy of `policy`; the torques of every third robot deviate by `explore` at least."""
+        super().__init__(task, policy, generator)
+        third = torch.arange(len(task.torque)) % 3 == 0
+        self._least = torch.where(third, explore, 0.0)[:, None]
+
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
         task = self.task
         noise = torch.randn(mean.shape, generator=self.generator)
-        torque = (mean + scale * noise).clamp(-1.0, 1.0).numpy()
+        torque = (mean + torch.maximum(scale, self._least) * noise).clamp(-1.0, 1.0).numpy()
         return torque, {"features": task.features(), "side": task.side.copy(), "action": task.action_of(torque)}
 
 

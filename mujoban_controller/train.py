@@ -79,7 +79,8 @@ class TrainConfig:
     distil: DistilConfig = field(default_factory=DistilConfig)
     asymmetric: MPOTrainingConfig = field(
         default_factory=lambda: MPOTrainingConfig(
-            window=16, windows=16, sequence=16, replay=64_000, first=6_000, normalised=500
+            window=16, windows=16, sequence=16, replay=64_000, first=6_000, normalised=2_000, critic_first=8_000,
+            explore=0.3, policy_rate=1e-4,
         )
     )
     """Of the stage mpo."""
@@ -163,7 +164,7 @@ class _Parts:
         learner = MPOLearner(policy, config.task.body, config.asymmetric, self.generator(), self.validation)
 
         def player() -> Player:
-            return ExploringPlayer(self.task, policy, self.generator())
+            return ExploringPlayer(self.task, policy, self.generator(), config.asymmetric.explore)
 
         return learner, self._replay_with_bags(player, policy, config.asymmetric)
 

@@ -72,7 +72,7 @@ def play_and_record(path, seed):
                 np.zeros(1, np.float32), np.zeros(1, np.float32), never, np.array([step == LENGTH - 1]),
                 Ending(task.world.observation(), task.world.truth()) if step == LENGTH - 1 else None,
             ))  # fmt: skip
-            live[-1] |= {"reward": result.reward[0], "discount": result.discount[0]}
+            live[-1] |= {"reward": result.reward[0], "discount": result.discount[0], "truncated": result.truncated[0]}
     return {name: np.stack([tick[name] for tick in live])[:-1] for name in live[0]}
 
 
@@ -88,7 +88,7 @@ def test_the_transitions_are_those_of_the_goal_task(recorded):
     found = transitions(ticks, CONFIG)
     assert found.keys() - live.keys() == {"first"} and np.flatnonzero(found["first"]).tolist() == [0]
     assert (live["discount"] == 0).sum() == 1 and (live["reward"] > 1.0).sum() >= 2
-    live["discount"][-1] = 0.0
+    live["discount"][-1], live["truncated"][-1] = 0.0, True
     # The speed of a box, and with it where that will come to rest, is estimated: bags do not hold it.
     speed = -FEATURES_AFTER_SPEED - 1
     assert np.corrcoef(found["features"][:, speed], live["features"][:, speed])[0, 1] > 0.9

@@ -22,6 +22,7 @@ from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, make_trainer
 from mujoban_core.grid import Instruction
 from mujoban_rl.engine import Trainer
+from mujoban_rl.limits import NaNGuard
 from mujoban_rl.run_directory import RunDirectory, RunError
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import load_weights, save_weights
@@ -107,6 +108,22 @@ def test_a_run_directory_belongs_to_one_configuration(tmp_path):
 def test_training_levels_are_never_test_levels():
     episodes = TrainingEpisodes(1, np.random.default_rng(0), max_nodes=10_000)
     assert all(episodes().seed in TRAIN_SEEDS for _ in range(5))
+
+
+def test_what_would_have_come_after_an_episode_that_was_cut_off_teaches_the_critic_nothing(tmp_path):
+    def critic_after(reward):
+        trainer = make_trainer(Options(tmp_path / str(reward), STAGES["mpo"], evaluation_episodes=0))
+        batch = trainer.source.next_batch()
+        cut = torch.zeros_like(batch["discount"], dtype=torch.bool)
+        cut[0] = True
+        batch = batch | {"truncated": cut, "reward": batch["reward"].clone()}
+        batch["reward"][0] = reward
+        trainer.learner.update(batch, 0.0, NaNGuard())
+        trainer.source.close()
+        return trainer.learner.critic.state_dict()
+
+    one, other = critic_after(0.0), critic_after(100.0)
+    assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_imitation_prefers_the_teachers_torque():
