@@ -28,18 +28,20 @@ from mujoban_baselines.task import TaskConfig
 from mujoban_baselines.train import MPORunConfig, Parts, VTraceRunConfig, mpo_parts, vtrace_parts
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.limits import NaNGuard
+from mujoban_rl.losses.mpo_continuous import MPOConfig
 
 SOLVED: Final = 0.9
 """Share of episodes that must end at the red square."""
 _BETWEEN: Final = 20
 """Updates between two looks at how far it is."""
 _QUICK: Final = MPOTrainingConfig(
-    window=12, warm_up=2, windows=16, replay=12_000, first=2_000, n_step=3, reuse=2.0, rate=1e-3, gamma=0.95
+    window=12, warm_up=2, windows=16, replay=12_000, first=1_000, n_step=3, reuse=2.0, rate=1e-3, gamma=0.9,
+    target_period=10, loss=MPOConfig(epsilon_mean=0.03, epsilon_scale=1e-3, initial_temperature=0.3),
 )
 
 
 _ROBOTS: Final = 16
-_UNROLL: Final = VTraceTrainingConfig(unroll=10, rate=1e-3, gamma=0.95)
+_UNROLL: Final = VTraceTrainingConfig(unroll=10, rate=1e-3, gamma=0.9)
 
 
 def _mpo(critic: Any) -> Parts:

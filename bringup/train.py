@@ -1,4 +1,4 @@
-"""Train a module: `mujoban-train controller|planner|estimator OPTIONS`, or `python -m bringup.train ...`."""
+"""Train a module: `mujoban-train controller|planner|estimator|baselines OPTIONS`, or `python -m bringup.train ...`."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ TRAINERS: Final = {
     "controller": "mujoban_controller.train",
     "planner": "mujoban_planner.train",
     "estimator": "mujoban_estimator.train",
+    "baselines": "mujoban_baselines.train",
 }
 """What can be trained; estimator and termination learn together."""
 

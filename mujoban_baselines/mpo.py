@@ -59,6 +59,8 @@ class MPOTrainingConfig:
     rate: float = 3e-4
     """Learning rate of agent and critic."""
     clip: float = 40.0
+    critic_first: int = 0
+    """Updates in which the critic learns alone; an agent that can something already needs it."""
     normalised: int = 500
     """Updates after which the normalisation of proprioception stays as it is."""
     loss: MPOConfig = field(
@@ -179,9 +181,8 @@ class MPOLearner(Learner[Batch]):
             _flat(online.action), _flat(x[:, warm:] for x in target.action),
             action[:, :, warm:].flatten(1, 2), q[:, :, warm:].flatten(1),
         )  # fmt: skip
-        norm = guarded_step(
-            critic_loss + policy_loss, [self._adam, self._dual_adam], guard, clip=config.clip
-        )
+        loss = critic_loss + policy_loss if self._updates >= config.critic_first else critic_loss
+        norm = guarded_step(loss, [self._adam, self._dual_adam], guard, clip=config.clip)
         if norm is None:
             return {}
         if self._updates < config.normalised:

@@ -124,7 +124,9 @@ class RecurrentAgent(nn.Module, Agent):
         self.config: dict[str, Any] = {"body": body}
         self.mixed_precision = False
         """Whether convolutions compute in bfloat16: training does, the robot does not, so that runs repeat exactly."""
-        self.action_size, self.hidden, self.width = get_body(body).action_size, hidden, trunk[-1]
+        layout = get_body(body)
+        self.proprio_size, self.action_size = layout.proprio_size, layout.action_size
+        self.hidden, self.width = hidden, trunk[-1]
         self.lstm = nn.LSTMCell(embedded, hidden)
         self.trunk = dense(hidden + embedded, *trunk)
         self.mean, self.scale = gaussian_layers(self.width, self.action_size)

@@ -1,4 +1,6 @@
-"""Train an agent of Table 1: `python -m mujoban_baselines.train monolithic-mpo|monolithic-vtrace|structured-vtrace`.
+"""Train an agent of Table 1: `python -m mujoban_baselines.train METHOD --run DIR`.
+
+Methods: monolithic-mpo, clone (what MPO may start from), monolithic-vtrace, structured-vtrace.
 
 Give the directory again to resume a run; it leaves `agent.safetensors`, for `bringup/evaluate.py --agent`.
 """
@@ -18,6 +20,7 @@ import tyro
 
 from mujoban_baselines.actor import TaskFactory, make_actor
 from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAgent
+from mujoban_baselines.cloning import BagSource, CloningConfig, CloningLearner
 from mujoban_baselines.critics import AsymmetricCritic, Critic, SymmetricCritic
 from mujoban_baselines.impala import VTraceLearner, VTraceTrainingConfig
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, ReplayStore
@@ -26,7 +29,7 @@ from mujoban_core.program import read_options, run_command
 from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import provenance
+from mujoban_rl.weights import load_weights, provenance
 
 PROG = "mujoban_baselines.train"
 Size = Literal["S", "M", "L"]
@@ -57,6 +60,8 @@ class MPORunConfig(RunConfig):
     """Variant of the network."""
     critic: Literal["asymmetric", "symmetric"] = "asymmetric"
     """What the critic sees: the simulator's truth, or what the agent sees, on one torso."""
+    start: Path | None = None
+    """Weights to start from, such as those of a cloning; their size counts."""
     mpo: MPOTrainingConfig = field(default_factory=MPOTrainingConfig)
 
 
@@ -70,6 +75,15 @@ class VTraceRunConfig(RunConfig):
     vtrace: VTraceTrainingConfig = field(default_factory=VTraceTrainingConfig)
 
 
+@dataclass(frozen=True)
+class CloneRunConfig(RunConfig):
+    """A run of behaviour cloning."""
+
+    size: Size = "S"
+    """Variant of the network."""
+    cloning: CloningConfig = field(default_factory=CloningConfig)
+
+
 Parts = tuple[Learner[Any], Source[Any]]
 """What a trainer drives."""
 
@@ -78,8 +92,13 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
     """Return learner and source of monolithic MPO (paper D.1), on Mujoban or on a task of one's own."""
     torch.manual_seed(config.seed)  # the initial weights
     body, mpo = config.task.body, config.mpo
-    build = partial(MonolithicAgent, body, config.size)
-    agent = build()
+    if config.start is None:
+        agent = MonolithicAgent(body, config.size)
+    else:
+        agent = load_weights(MonolithicAgent, config.start).train()
+        if agent.config["body"] != body:
+            raise ValueError(f"--start {config.start}: of the body {agent.config['body']}, expected {body}")
+    build = partial(MonolithicAgent, **agent.config)
     critic: Critic = AsymmetricCritic(body) if config.critic == "asymmetric" else SymmetricCritic(body, agent.width)
     streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(2)]
     generators = [torch.Generator().manual_seed(seed) for seed in streams]
@@ -105,13 +124,27 @@ def vtrace_parts(
     return VTraceLearner(build(), unroll), source
 
 
-def make_trainer(config: RunConfig, parts: Parts, run: Path, cadence: Cadence, method: str) -> Trainer[Any]:
-    """Make, or resume, a run."""
+def clone_parts(config: CloneRunConfig, bags: Sequence[Path]) -> Parts:
+    """Return learner and source of a cloning from bags.
+
+    Raises:
+        BagError: If there is no bag at a path, or one lacks a topic.
+    """
+    torch.manual_seed(config.seed)  # the initial weights
+    agent = MonolithicAgent(config.task.body, config.size)
+    source = BagSource(bags, agent, config.cloning, np.random.default_rng(config.seed))
+    return CloningLearner(agent, config.cloning), source
+
+
+def make_trainer(
+    config: RunConfig, parts: Parts, run: Path, cadence: Cadence, method: str, data: str | None = None
+) -> Trainer[Any]:
+    """Make, or resume, a run of a method; `data` says what it learns from, if not from its own play."""
     directory = RunDirectory(run, {**asdict(config), "method": method})
     record = {
         **provenance(),
         "training": directory.config,
-        "data": f"own play of generated levels ({config.task.levels}), training seeds",
+        "data": data or f"own play of generated levels ({config.task.levels}), training seeds",
         "world": config.task.world,
     }
     return Trainer(directory, *parts, config.budget, cadence, record=record)
@@ -154,6 +187,23 @@ class MonolithicMPO(_Command):
 
 
 @dataclass(frozen=True)
+class Clone(_Command):
+    """Behaviour cloning of whoever played recorded bags, for `monolithic-mpo --start`."""
+
+    bags: tuple[Path, ...] = ()
+    """Bags, or folders of bags, such as `bringup/record.py --undisturbed` writes."""
+    config: Annotated[CloneRunConfig, tyro.conf.arg(name="")] = field(default_factory=CloneRunConfig)
+
+    def trainer(self) -> Trainer[Any]:
+        """Make or resume the run."""
+        if not self.bags:
+            raise ValueError("--bags is missing, expected bags or folders of bags")
+        parts = clone_parts(self.config, self.bags)
+        data = f"bags {', '.join(bag.name for bag in self.bags)}"
+        return make_trainer(self.config, parts, self.run, self.cadence(100, 1000), "cloning", data)
+
+
+@dataclass(frozen=True)
 class MonolithicVTrace(_Command):
     """Fully observable monolithic RL: view from above and proprioception to torques, by V-trace (paper D.2)."""
 
@@ -179,6 +229,7 @@ class StructuredVTrace(_Command):
 
 COMMANDS: dict[str, type[_Command]] = {
     "monolithic-mpo": MonolithicMPO,
+    "clone": Clone,
     "monolithic-vtrace": MonolithicVTrace,
     "structured-vtrace": StructuredVTrace,
 }

@@ -9,7 +9,7 @@ Shapes: L ticks of an episode, R rows, K boxes, N rows and columns of the grid, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -32,8 +32,9 @@ from mujoban_core.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMI
 from mujoban_core.interfaces import renew_rows
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
-from mujoban_msgs_py.bags.training import episode_ticks, find_bags, open_training_bag
+from mujoban_msgs_py.bags.training import episodes, find_bags, open_training_bag
 from mujoban_rl.engine import State
+from mujoban_rl.recordings import EndlessEpisodes
 from mujoban_sim.goals import GoalKind, GoalTracker
 from mujoban_sim.oracles import cells_of_boxes
 
@@ -51,22 +52,6 @@ TOPICS: Final = (
     topics.TRUE_TERMINATION,
 )
 """What training needs of a bag."""
-
-
-def episodes(bag: Bag) -> Iterator[list[tuple[Any, ...]]]:
-    """Yield the ticks of each episode, in the order of `TOPICS`, from its start up to a tick that is missing.
-
-    Raises:
-        BagError: As `episode_ticks`.
-    """
-    found: list[tuple[Any, ...]] = []
-    for reading, values in episode_ticks(bag, TOPICS):
-        if reading.step == 0 and found:
-            yield found
-            found = []
-        found.append(values)
-    if found:
-        yield found
 
 
 def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fields:
@@ -160,55 +145,6 @@ def _goals(
     return goals, np.array(elapsed)
 
 
-class _Row:
-    """The endless ticks of one robot: bag after bag, in an order that is drawn anew each time."""
-
-    def __init__(
-        self, bags: Sequence[Bag], read: Callable[[Bag, int], Fields | None], rng: np.random.Generator
-    ) -> None:
-        """Begin with a random bag; `read` returns the fields of a bag's episode by its number, None behind the last."""
-        self._bags, self._read, self._rng = bags, read, rng
-        self._order: list[int] = []
-        self._bag = self._episode = self._tick = 0
-        self._fields: Fields | None = None
-
-    def next(self) -> tuple[Fields, int]:
-        """Return the fields of an episode, [L - 1, ...], and the number of the tick whose turn it is."""
-        fields = self._fields
-        if fields is None or self._tick == len(fields["first"]):
-            fields = self._following(begin=fields is None)
-            self._fields, self._tick = fields, 0
-        self._tick += 1
-        return fields, self._tick - 1
-
-    def _following(self, *, begin: bool) -> Fields:
-        """Return the fields of the episode that comes next."""
-        if not begin:
-            self._episode += 1
-        empty = 0
-        while True:
-            if self._bag == len(self._order):
-                self._order, self._bag = self._rng.permutation(len(self._bags)).tolist(), 0
-            if (fields := self._read(self._bags[self._order[self._bag]], self._episode)) is not None:
-                return fields
-            empty = empty + 1 if self._episode == 0 else 0
-            if empty == len(self._bags):
-                raise BagError(f"no episode of 2 ticks in {len(self._bags)} bags")
-            self._bag, self._episode = self._bag + 1, 0
-
-    def state(self) -> State:
-        """Return where it is."""
-        return State({"order": self._order, "bag": self._bag, "episode": self._episode, "tick": self._tick})
-
-    def restore(self, state: State) -> None:
-        """Go on where it was."""
-        values = state.values
-        self._order, self._bag = list(values["order"]), values["bag"]
-        self._episode, self._tick = values["episode"], values["tick"]
-        began = self._bag < len(self._order)
-        self._fields = self._read(self._bags[self._order[self._bag]], self._episode) if began else None
-
-
 class BagTicks(Iterator[Fields]):
     """Endless ticks of R episodes at a time, with the memory of the policy that learns."""
 
@@ -231,12 +167,12 @@ class BagTicks(Iterator[Fields]):
         """
         self._config, self._policy, self._rng, self._teacher = config, policy, rng, teacher
         bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
-        self._rows = [_Row(bags, self._read, rng) for _ in range(rows)]
+        self._rows = [EndlessEpisodes(bags, self._read, rng) for _ in range(rows)]
         self._memory = Recurrent(*policy.initial_memory(rows))
 
     def _read(self, bag: Bag, number: int) -> Fields | None:
         """Return the fields of episode `number` of a bag among those of two ticks or more; None behind the last."""
-        long = (ticks for ticks in episodes(bag) if len(ticks) > 1)
+        long = (ticks for ticks in episodes(bag, TOPICS) if len(ticks) > 1)
         ticks = next(islice(long, number, None), None)
         if ticks is None:
             return None

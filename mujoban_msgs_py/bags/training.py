@@ -145,3 +145,19 @@ def episode_ticks(
             following += 1
             report.ticks += 1
             yield EpisodeTick(reading, tick.values)
+
+
+def episodes(bag: Bag, wanted: Sequence[Topic]) -> Iterator[list[tuple[Any, ...]]]:
+    """Yield the ticks of each episode, in the order of the topics, from its start up to a tick that is missing.
+
+    Raises:
+        BagError: As `episode_ticks`.
+    """
+    found: list[tuple[Any, ...]] = []
+    for reading, values in episode_ticks(bag, wanted):
+        if reading.step == 0 and found:
+            yield found
+            found = []
+        found.append(values)
+    if found:
+        yield found

@@ -13,7 +13,7 @@ import torch
 
 from bringup.rollout import Ending, Tick
 from bringup.rollout_recorder import Recorder
-from mujoban_controller.bag_ticks import TOPICS, BagTicks, episodes, labels, transitions
+from mujoban_controller.bag_ticks import TOPICS, BagTicks, labels, transitions
 from mujoban_controller.controller import Recurrent, VisuomotorController
 from mujoban_controller.distil import DistilConfig
 from mujoban_controller.goal_features import feature_layout, goal_offsets
@@ -29,7 +29,7 @@ from mujoban_core.interfaces import Observation, TerminationOutput
 from mujoban_core.sense_plan_act import Decision
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
-from mujoban_msgs_py.bags.training import open_training_bag
+from mujoban_msgs_py.bags.training import episodes, open_training_bag
 from mujoban_rl.testing import check_resuming
 from mujoban_rl.weights import save_weights
 from mujoban_sim.oracles import OraclePlanner
@@ -84,7 +84,7 @@ def recorded(tmp_path_factory):
 
 def test_the_transitions_are_those_of_the_goal_task(recorded):
     path, live = recorded
-    (ticks,) = episodes(open_training_bag(path / "row000", TOPICS))
+    (ticks,) = episodes(open_training_bag(path / "row000", TOPICS), TOPICS)
     found = transitions(ticks, CONFIG)
     assert found.keys() - live.keys() == {"first"} and np.flatnonzero(found["first"]).tolist() == [0]
     assert (live["discount"] == 0).sum() == 1 and (live["reward"] > 1.0).sum() >= 2
@@ -185,7 +185,7 @@ def test_a_missing_topic_is_named_in_one_line(recorded, tmp_path):
 def test_episodes_that_are_kept_for_tests_are_refused(tmp_path):
     play_and_record(tmp_path, 5)
     with pytest.raises(BagError, match="seed 5"):
-        next(episodes(open_training_bag(tmp_path / "row000", TOPICS)))
+        next(episodes(open_training_bag(tmp_path / "row000", TOPICS), TOPICS))
 
 
 def test_stages_that_would_not_learn_from_bags_refuse_them(recorded, tmp_path):

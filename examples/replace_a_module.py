@@ -1,0 +1,49 @@
+"""Replace a module: `python examples/replace_a_module.py [EPISODES]`.
+
+The planner here walks at random and pushes what is in its way. A module is one class with a batch axis and explicit
+memory; the rest of the stack stays as it is. From the command line: `--planner package.module:Class`, with every
+program; docs/swap_a_planner.md says more.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bringup.command import Choice, Stack
+from bringup.evaluate import evaluate
+from bringup.results import report, summary
+from mujoban_core.grid import Instruction
+from mujoban_core.interfaces import Memory, Planner
+from mujoban_core.plugins import ROLES
+from mujoban_sokoban.episodes import Episodes
+
+
+class RandomPlanner(Planner):
+    """Says north, east, south or west, whatever it is told of the map."""
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return the number of decisions so far, [B]."""
+        return (np.zeros(batch, np.int64),)
+
+    def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
+        """Return an instruction for each robot, [M]."""
+        (decisions,) = memory
+        moves = [np.random.default_rng(n).integers(Instruction.NORTH, Instruction.WEST + 1) for n in decisions]
+        return np.array(moves, np.int64), (decisions + 1,)
+
+
+def main(episodes: int) -> None:
+    """Play the same levels with either planner."""
+    levels = Episodes(episodes, 0, difficulty=1)
+    oracles = Stack({role: Choice(role, "oracle") for role in ROLES}).policy()
+    for name, policy in {"oracle": oracles, "random": replace(oracles, planner=RandomPlanner())}.items():
+        results = evaluate(policy, levels, time_limit=1200)
+        print(f"{name} planner", *summary(report(results, {"planner": name})), sep="\n  ")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 32)

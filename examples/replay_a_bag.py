@@ -1,0 +1,37 @@
+"""Read a recorded bag tick by tick, without ROS: `python examples/replay_a_bag.py BAG`.
+
+`bringup/run_stack.py --record BAG` and `bringup/record.py` write bags; `ros2 bag play BAG` plays one back as topics.
+Here its torques are applied again to the level that it names: the world is the same to the last bit.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from mujoban_msgs_py import topics
+from mujoban_msgs_py.bags.training import episodes, open_training_bag
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.levels import Level
+
+TOPICS = (topics.TRUE_EPISODE, topics.POSE, topics.TORQUE)
+
+
+def main(path: Path) -> None:
+    """Play every episode of a bag again and say how far the robot is from where it was recorded."""
+    for ticks in episodes(open_training_bag(path, TOPICS), TOPICS):
+        spec = EpisodeSpec(Level.from_text(ticks[0][0].level), ticks[0][0].seed)
+        world = World(1, max_boxes=len(spec.level.boxes))
+        world.reset([0], [spec])
+        apart = 0.0
+        for _, pose, torque in ticks:
+            apart = max(apart, float(np.abs(world.pose[0] - pose).max()))
+            world.step(torque[None])
+        print(f"seed {spec.seed}: {len(ticks)} ticks, at most {apart:.1e} apart")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
