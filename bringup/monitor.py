@@ -26,6 +26,8 @@ from mujoban_sokoban.episodes import Episodes
 
 ANOTHER_RUN: Final = "messages of another run"
 """Kind under which `MonitorNode.counts` has what was refused."""
+_AHEAD: Final = 100 * topics.TICK
+"""Simulated time [ns] by which modules may be heard before the simulator; what is further ahead is a stranger's."""
 _WATCHED = (topics.INSTRUCTION, topics.TERMINATION, topics.ABSTRACT_STATE, topics.TRUE_ABSTRACT_STATE)
 
 
@@ -103,7 +105,7 @@ class MonitorNode(Node):
         return self.ticks / seconds if seconds > 0 else 0.0
 
     def _receive(self, name: str, message: Received) -> None:
-        if message.stamp <= self._joined:
+        if not self._joined < message.stamp <= self.stamp + _AHEAD:
             return
         joined = self._join.add(name, message.stamp, message.content)
         if joined is not None:
@@ -133,6 +135,8 @@ class MonitorNode(Node):
         elif message.header.stamp == self.episode.header.stamp:
             return
         self.episode = message
+        if self._joined > self.stamp + _AHEAD:  # what was joined was of no tick of the simulator's
+            self._joined = -1
         if message.terminated or message.truncated:
             self._end = message
             self._finish_when_joined()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
 from benchmarks.malformed import TARGETS, Vandal
@@ -14,6 +15,7 @@ from bringup.monitor import ANOTHER_RUN
 from bringup.viz import VizNode
 from mujoban_msgs_py import conversions, listening, topics
 from mujoban_msgs_py.bags import open_bag
+from mujoban_msgs_py.decoders import DECODERS
 from mujoban_msgs_py.listening import Received
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import generate_level
@@ -157,6 +159,23 @@ def test_messages_that_are_no_messages_are_named_by_topic(play_graph, capfd):
     graph.spin_until(lambda: graph.monitor.counts["rejected messages"] == 2)
     assert graph.finish()[0].solved
     assert "rejected a message on /instruction: direction must be one of 0 (STAY)" in capfd.readouterr().err
+
+
+def test_a_tick_from_far_ahead_does_not_keep_those_of_the_run_from_being_counted(play_graph):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
+    graph.spin_until(lambda: graph.monitor.ticks >= 2)
+    header, state = conversions.header(10**15), np.zeros((10, 10, 4), np.float32)
+    for topic, message in (
+        (topics.INSTRUCTION, conversions.instruction_to_msg(header, 1, 1)),
+        (topics.TERMINATION, conversions.termination_to_msg(header, 1, 0.0, False)),
+        (topics.ABSTRACT_STATE, conversions.abstract_state_to_msg(header, state)),
+        (topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_to_msg(header, state)),
+    ):
+        raw = serialize_message(message)
+        graph.monitor._receive(topic.name, Received(10**15, DECODERS[topic](message), raw))
+    ticks = graph.monitor.ticks
+    graph.spin_until(lambda: graph.monitor.ticks > ticks + 3)
+    assert graph.finish()[0].solved
 
 
 def test_a_flood_of_instructions_does_not_wash_away_the_one_that_is_waited_for(play_graph):
