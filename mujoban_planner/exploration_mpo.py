@@ -43,8 +43,10 @@ _STREAM: Final = 3
 class ExplorerConfig(PlayConfig):
     """What defines a run."""
 
-    channels: int = 32
-    blocks: int = 4
+    channels: int = 16
+    blocks: int = 3
+    horizon: float = 10.0
+    """Mean instructions of an episode, which ends at random: what there is to learn happens soon after its start."""
     reward: ExplorationReward = field(default_factory=ExplorationReward)
     environments: int = 128
     levels: int = 4096
@@ -83,6 +85,9 @@ class ExplorerActor(Actor):
         symmetries = torch.randint(SYMMETRIES, (count, 1), generator=self._generator)
         return view_states(self._pool[rows], symmetries).numpy()
 
+    def _ends(self, count: int) -> NDArray[np.bool_]:
+        return (torch.rand(count, generator=self._generator) < 1.0 / self._config.horizon).numpy()
+
     def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
         """Explore with these weights."""
         self._explorer.load_state_dict(weights)
@@ -99,12 +104,13 @@ class ExplorerActor(Actor):
             chances = functional.softmax(policy.float(), 1)
             action = torch.multinomial(chances, 1, generator=self._generator)[:, 0].numpy()
             step = self._environment.step(action)
-            over = np.flatnonzero(step.complete | step.truncated)
+            cut = step.truncated | ~step.complete & self._ends(len(action))
+            over = np.flatnonzero(step.complete | cut)
             self._environment.begin(over, self._draw(len(over)))
             steps += len(action)
             rewards += step.reward.tolist()
             kept = {"state": state.astype(np.float16), "instruction": action, "reward": step.reward}
-            sequence = self._builder.add({**kept, "terminated": step.complete, "dropped": step.truncated})
+            sequence = self._builder.add({**kept, "terminated": step.complete, "dropped": cut})
         return Experience(sequence, steps, {"reward": np.array(rewards)})
 
     def state(self) -> State:
