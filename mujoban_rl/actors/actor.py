@@ -28,6 +28,23 @@ class ActorError(RuntimeError):
 
 
 @dataclass(frozen=True)
+class ActorState:
+    """Where an actor is, as it goes between processes: a copy of `Actor.state`."""
+
+    values: dict[str, Any]
+    arrays: Arrays
+
+    @classmethod
+    def of(cls, state: State) -> ActorState:
+        """Copy a state, which may share its memory with an actor that plays on."""
+        return cls(state.values, {name: tensor.cpu().numpy().copy() for name, tensor in state.tensors.items()})
+
+    def to_state(self) -> State:
+        """Return a copy for an actor to go on from; arrays that come over Ray may not be written to."""
+        return State(self.values, {name: torch.tensor(array) for name, array in self.arrays.items()})
+
+
+@dataclass(frozen=True)
 class Experience:
     """One sequence of every environment of an actor, or whatever else an actor delivers at a time."""
 
@@ -43,6 +60,8 @@ class Experience:
     """Number of the actor."""
     cpu_seconds: float = 0.0
     """CPU time of the actor's process since it last delivered."""
+    left: ActorState | None = None
+    """Where the actor is after it, for its pool alone, which asks for it."""
 
 
 class Actor(ABC):
@@ -86,6 +105,10 @@ class Order:
     version: int
     weights: Arrays | None
     """None where the actor has this version already."""
+    start: ActorState | None = None
+    """Where to go on from; None where the actor stands there already."""
+    report: bool = False
+    """Whether the pool wants to know where the actor is afterwards."""
 
 
 class Seat:
@@ -102,6 +125,9 @@ class Seat:
             # A copy, since arrays that come over Ray may not be written to.
             weights = {name: torch.tensor(array) for name, array in order.weights.items()}
             self.actor.set_weights(weights, order.version)
+        if order.start is not None:
+            self.actor.restore(order.start.to_state())
         experience = self.actor.act()
+        left = ActorState.of(self.actor.state()) if order.report else None
         spent, self._cpu = time.process_time() - self._cpu, time.process_time()
-        return dataclasses.replace(experience, version=order.version, cpu_seconds=spent)
+        return dataclasses.replace(experience, version=order.version, cpu_seconds=spent, left=left)

@@ -9,7 +9,7 @@ import socket
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import torch
@@ -171,7 +171,7 @@ class RayPool(ActorPool):
             if self._shared is None or self._shared[0] != order.version:
                 self._shared = order.version, self._ray.put(dict(order.weights))
             weights = self._shared[1]
-        self._answers[actor] = self._actors[actor].play.remote(self.factory, order.version, weights)
+        self._answers[actor] = self._actors[actor].play.remote(self.factory, replace(order, weights=None), weights)
 
     def _receive(self, actor: int) -> Experience:
         errors = self._ray.exceptions
@@ -196,8 +196,8 @@ class _RemoteSeat:
         self._stream = stream
         self._seat: Seat | None = None
 
-    def play(self, factory: ActorFactory, version: int, weights: Arrays | None) -> Experience:
+    def play(self, factory: ActorFactory, order: Order, weights: Arrays | None) -> Experience:
         # Made here, since Ray reports an error in a constructor as the death of the actor.
         if self._seat is None:
             self._seat = Seat(factory(self._stream))
-        return self._seat.play(Order(version, weights))
+        return self._seat.play(replace(order, weights=weights))

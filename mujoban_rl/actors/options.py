@@ -21,11 +21,12 @@ class ActorOptions:
     """
 
     actors: Literal["local", "threads", "processes", "ray"] = "local"
-    """In the learner's process by turns (such a run resumes to the bit), in threads, in processes, or on Ray."""
+    """In the learner's process by turns, in threads, in processes, or on Ray."""
     num_actors: int = 1
     schedule: Schedule | None = None
     """`turns`: actors and learner by turns; `ordered`: both at once, in an order that makes runs repeatable; `first`:
-    both at once, whoever is ready first. By default `turns` for local, `first` for ray, `ordered` for the others."""
+    both at once, whoever is ready first, so that no run is like another. By default `turns` for local, `first` for
+    ray, `ordered` for the others."""
     address: str | None = None
     """Ray cluster to join: `auto`, HOST:PORT or ray://HOST:PORT; without it one is started on this machine."""
     actor_cpus: float = 1.0

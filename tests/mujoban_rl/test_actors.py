@@ -19,7 +19,7 @@ from mujoban_rl.actors import ActorError, ActorOptions, ActorSource
 from mujoban_rl.actors.local import LocalPool, ThreadPool
 from mujoban_rl.actors.pool import ActorDied
 from mujoban_rl.actors.processes import ProcessPool
-from mujoban_rl.engine import Budget, Cadence, Trainer
+from mujoban_rl.engine import Budget, Cadence, State, Trainer
 from mujoban_rl.run_directory import RunDirectory
 
 STEPS = TICKS * ROWS
@@ -67,16 +67,34 @@ def test_by_turns_all_actors_play_with_the_newest_weights():
     assert [e.version for e in played(LocalPool(Walkers(), 2))] == [0, 0, 2, 2, 4, 4, 6, 6]
 
 
-@pytest.mark.parametrize("schedule", ["turns", "ordered"])
-def test_a_run_with_local_actors_resumes_to_the_bit_in_the_middle_of_a_round(tmp_path, schedule):
-    whole = trainer(tmp_path / "whole", LocalPool(Walkers(), 3, schedule))
+@pytest.mark.parametrize(
+    ("make", "count", "schedule", "stops"),
+    [
+        (LocalPool, 3, "turns", (11, 17)),
+        (LocalPool, 3, "ordered", (11, 17)),
+        (ThreadPool, 3, "ordered", (1, 11)),  # after the first stop not every actor has been heard of
+        (ProcessPool, 2, "ordered", (11,)),
+    ],
+)
+def test_a_run_with_actors_resumes_to_the_bit_in_the_middle_of_a_round(tmp_path, make, count, schedule, stops):
+    whole = trainer(tmp_path / "whole", LocalPool(Walkers(), count, schedule))
     assert whole.run()
-    for stop in (11, 17):
-        assert not trainer(tmp_path / "parts", LocalPool(Walkers(), 3, schedule)).run(limit_updates=stop)
-    last = trainer(tmp_path / "parts", LocalPool(Walkers(), 3, schedule))
-    assert last.progress.updates == 17 and last.run()
+    for stop in stops:
+        assert not trainer(tmp_path / "parts", make(Walkers(), count, schedule)).run(limit_updates=stop)
+    last = trainer(tmp_path / "parts", make(Walkers(), count, schedule))
+    assert last.progress.updates == stops[-1] and last.run()
     assert torch.equal(whole.learner.net.weight, last.learner.net.weight)
     assert whole.progress.samples == last.progress.samples
+
+
+def test_an_actor_that_does_not_say_where_it_is_plays_no_stream_twice(tmp_path, monkeypatch):
+    monkeypatch.setattr(toy_actors.Walker, "state", lambda _: State())
+    played = []
+    for updates in (10, 40):
+        run = trainer(tmp_path, LocalPool(Walkers(), 1, "ordered"))
+        run.run(limit_updates=updates)
+        played.append({stream for stream, _ in run.source.store.origins})
+    assert played == [{0}, {1}]
 
 
 def test_steps_per_update_stay_as_they_were_asked_for(tmp_path):
