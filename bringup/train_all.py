@@ -22,7 +22,7 @@ from mujoban_core.program import read_options, run_command
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import TRAIN_SEEDS, VALIDATION_SEEDS
 
-PROG = "mujoban.train_all"
+PROG = "bringup.train_all"
 WEIGHTS: Final = {
     "controller": "controller_mpo/controller.safetensors",
     "planner": "planner_views/planner.safetensors",

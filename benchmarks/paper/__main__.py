@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.command import run_benchmark
 from benchmarks.paper import curves, figures, film, tables
-from benchmarks.paper.runs import ALL, CONFIGURATIONS, DIFFICULTY, RESULTS, SEED, ResultError, Run, is_stale
+from benchmarks.paper.runs import ALL, CONFIGURATIONS, DIFFICULTY, RESULTS, SEED, Run, is_stale
 from mujoban_sim.rendering import RenderingError
 
 INTRODUCTION = f"""# Results
@@ -27,33 +29,43 @@ TABLE_2 = """Each configuration replaces modules by oracles.
 """
 
 
-def main(folder: Path = RESULTS) -> int:
-    """Write README.md and the figures; return 1 if a source is damaged."""
+@dataclass(frozen=True)
+class Options:
+    """Options of the command."""
+
+    out: Path = RESULTS
+    """Folder of the page and its figures."""
+
+
+def rebuild(options: Options) -> str:
+    """Write README.md and the figures; return the path of the page.
+
+    Raises:
+        ResultError: If a source is damaged.
+    """
+    folder = options.out
     folder.mkdir(parents=True, exist_ok=True)
-    try:
-        sections = [
-            INTRODUCTION,
-            "## Table 1: main results, modular row\n",
-            tables.configurations(CONFIGURATIONS[:1]),
-            "## Table 2: module evaluation\n",
-            TABLE_2,
-            tables.configurations(CONFIGURATIONS),
-            "Why episodes fail:\n",
-            tables.failures(CONFIGURATIONS),
-            "## Figure 2: success against difficulty\n",
-            tables.configurations(DIFFICULTY),
-            tables.test_uses(ALL),
-            *_figure_2(DIFFICULTY, folder),
-            "## Figure 3: an episode\n",
-            *_figure_3(folder),
-            "## Figure 4: learning curves\n",
-            *_figure_4(folder),
-        ]
-    except ResultError as error:
-        print(f"results: error: {error}", file=sys.stderr)
-        return 1
-    (folder / "README.md").write_text("\n".join(sections))
-    return 0
+    sections = [
+        INTRODUCTION,
+        "## Table 1: main results, modular row\n",
+        tables.configurations(CONFIGURATIONS[:1]),
+        "## Table 2: module evaluation\n",
+        TABLE_2,
+        tables.configurations(CONFIGURATIONS),
+        "Why episodes fail:\n",
+        tables.failures(CONFIGURATIONS),
+        "## Figure 2: success against difficulty\n",
+        tables.configurations(DIFFICULTY),
+        tables.test_uses(ALL),
+        *_figure_2(DIFFICULTY, folder),
+        "## Figure 3: an episode\n",
+        *_figure_3(folder),
+        "## Figure 4: learning curves\n",
+        *_figure_4(folder),
+    ]
+    page = folder / "README.md"
+    page.write_text("\n".join(sections))
+    return str(page)
 
 
 def _figure_2(runs: Sequence[Run], folder: Path) -> list[str]:
@@ -96,4 +108,4 @@ def _missing(what: str, command: str) -> list[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_benchmark("benchmarks.paper", Options, rebuild, __doc__)
