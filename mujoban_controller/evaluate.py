@@ -7,7 +7,6 @@ with the scripted driver or a privileged teacher under the same judgement, which
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +20,8 @@ from mujoban_controller.drivers import Driver
 from mujoban_controller.judge import judge
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
-from mujoban_core.files import check_file, digest, write_atomically
-from mujoban_core.program import read_options, run_command
+from mujoban_core.files import check_file, digest
+from mujoban_core.program import give_report, read_options, run_command
 from mujoban_rl.weights import load_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -90,11 +89,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     told = {
         "weights": {"controller": identity}, "world": options.world, "n": options.episodes, "seed": options.seed,
     }  # fmt: skip
-    text = json.dumps({**report, **told}, indent=2)
-    if options.json is None:
-        print(text)
-    else:
-        write_atomically(options.json, (text + "\n").encode())
+    give_report({**report, **told}, options.json)
     return 0
 
 

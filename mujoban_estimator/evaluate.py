@@ -5,7 +5,6 @@ Both see what was recorded, the instructions and terminations included, whatever
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_core.files import check_file, write_atomically
+from mujoban_core.files import check_file
 from mujoban_core.interfaces import INSTRUCTION_LIMIT, renew_rows
-from mujoban_core.program import read_options, run_command
+from mujoban_core.program import give_report, read_options, run_command
 from mujoban_estimator import SHIPPED, SHIPPED_TERMINATION, load, load_termination
 from mujoban_estimator.bag_stream import TOPICS, stretches
 from mujoban_estimator.data import Batch, Batcher, Stretch, choose_windows
@@ -156,11 +155,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         load(options.estimator, options.device), load_termination(options.termination, options.device),
         find_bags(options.bags), max_ticks=options.max_ticks, skip_damaged=options.skip_damaged,
     )  # fmt: skip
-    text = json.dumps({k: None if v != v else round(v, 5) for k, v in result.items()}, indent=2)
-    if options.json is None:
-        print(text)
-    else:
-        write_atomically(options.json, (text + "\n").encode())
+    give_report({k: None if v != v else round(v, 5) for k, v in result.items()}, options.json)
     return 0
 
 

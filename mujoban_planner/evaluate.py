@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from mujoban_core.files import check_file, digest, write_atomically
+from mujoban_core.files import check_file, digest
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_core.program import read_options, run_command
+from mujoban_core.program import give_report, read_options, run_command
 from mujoban_core.stats import wilson_interval
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import MOVE_LIMIT
@@ -140,7 +139,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     if options.look_ahead:
         print(f"evaluations per level {result['evaluations_per_level']:.1f}  (at most {options.expansions} per search)")
     if options.json is not None:
-        write_atomically(options.json, (json.dumps(result, indent=2) + "\n").encode())
+        give_report(result, options.json)
     return 0
 
 

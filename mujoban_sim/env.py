@@ -24,6 +24,7 @@ from mujoban_sokoban.levels import Level
 Observations = dict[str, Any]
 """Arrays by name."""
 ObservationSet = Literal["default", "state", "privileged"]
+_RENDER_MODES: Final = ("rgb_array",)
 
 OBSERVATION_SETS: Final[dict[str, tuple[str, ...]]] = {
     "default": ("frame", "proprio", "pose"),
@@ -74,6 +75,12 @@ def draw_seed(generator: np.random.Generator) -> int:
 def observe(world: World, names: tuple[str, ...]) -> Observations:
     """Return copies of the named observations of all rows, each [B, ...]."""
     return {name: _READERS[name](world) for name in names}
+
+
+def check_render_mode(name: str | None) -> None:
+    """Raise `ValueError` unless `render` knows a mode."""
+    if name is not None and name not in _RENDER_MODES:
+        raise ValueError(f"unknown render_mode {name!r}: expected None or {' or '.join(map(repr, _RENDER_MODES))}")
 
 
 def check_observation_set(name: str) -> tuple[str, ...]:
@@ -155,7 +162,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium declares it so
-        "render_modes": ["rgb_array"],
+        "render_modes": list(_RENDER_MODES),
         "render_fps": round(1 / CONTROL_PERIOD),
     }
 
@@ -184,8 +191,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
         Raises:
             ValueError: if an argument is out of its range or the level file is malformed.
         """
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"unknown render_mode {render_mode!r}: expected None or 'rgb_array'")
+        check_render_mode(render_mode)
         self.render_mode = render_mode
         self._closed = False
         self._source = LevelSource.make(difficulty, level_file)

@@ -21,6 +21,7 @@ from mujoban_sim.env import (
     ObservationSet,
     check_observation_set,
     check_open,
+    check_render_mode,
     draw_seed,
     observation_space,
     observe,
@@ -70,8 +71,7 @@ class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]
             ValueError: if an argument is out of its range or the level file is malformed.
         """
         self.metadata = {**MujobanEnv.metadata, "autoreset_mode": AutoresetMode(autoreset_mode)}
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"unknown render_mode {render_mode!r}: expected None or 'rgb_array'")
+        check_render_mode(render_mode)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._source = LevelSource.make(difficulty, level_file)

@@ -1,10 +1,13 @@
 """Programs end without a word where nobody reads what they print."""
 
+import json
 import os
 import subprocess
 import sys
 
 import pytest
+
+from mujoban_core.program import give_report
 
 PROGRAM = """
 from dataclasses import dataclass
@@ -33,3 +36,11 @@ def test_a_reader_that_leaves_early_ends_a_program_quietly(arguments):
     finally:
         os.close(theirs)
     assert (ended.returncode, ended.stderr) == (141, "")
+
+
+def test_a_report_is_printed_or_written_but_not_both(tmp_path, capsys):
+    give_report({"n": 3}, None)
+    printed = capsys.readouterr().out
+    give_report({"n": 3}, tmp_path / "report.json")
+    assert json.loads(printed) == {"n": 3} and (tmp_path / "report.json").read_text() == printed
+    assert not capsys.readouterr().out
