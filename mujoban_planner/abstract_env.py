@@ -1,9 +1,9 @@
 """Thousands of Sokoban levels at once in torch, on CPU or GPU: the time-abstracted task of paper C.2.
 
-The rules and rewards are those of `mujoban_sokoban.rules`, which a property test holds it to on random levels and
-instructions. They stand here once more because they must run on a GPU, for all levels in a few tensor operations, where
-numba's bitboards cannot go. An instruction may fail, as with
-a real controller: the state then stays as it is and the abstract episode ends early.
+What may be walked and pushed is what `mujoban_sokoban.bitboard` says, rewards are those of `mujoban_sokoban.rules`:
+property tests hold it to both on random levels and instructions. They stand here once more because they must run on a
+GPU, for all levels in a few tensor operations, where numba's bitboards cannot go. An instruction may fail, as with a
+real controller: the state then stays as it is and the abstract episode ends early.
 
 Shapes: B levels, N = `grid.GRID_SIZE`.
 """

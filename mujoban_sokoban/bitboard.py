@@ -1,4 +1,4 @@
-"""Sets of cells as 64-bit integers, for generator and solver.
+"""Sets of cells as 64-bit integers: what may be walked and pushed, for the rules, the generator and the solver.
 
 Outer walls are closed, so whatever happens in a level happens in the 8 x 8 cells within the outermost ring of the
 grid: bit 8 (row - 1) + (column - 1) stands for cell (row, column). A *square* is such a bit's index. All sets are
@@ -101,6 +101,12 @@ def pushable(stands: Bits, free: Bits, boxes: Bits, direction: Int) -> Bits:
 
 
 @njit(cache=True, nogil=True, inline="always")
+def stepped(stands: Bits, free: Bits, boxes: Bits, direction: Int) -> Bits:
+    """Return where a robot comes to from one of `stands` by a step in a direction, onto free squares or by a push."""
+    return (shift(stands, direction) & free) | pushable(stands, free, boxes, direction)
+
+
+@njit(cache=True, nogil=True, inline="always")
 def pushed(boxes: Bits, square: Int, direction: Int) -> Bits:
     """Return the boxes after the one on a square was pushed."""
     return (boxes ^ bit(square)) | bit(square + SQUARE_STEP[direction])
@@ -135,7 +141,23 @@ def from_grid(grid: NDArray[np.bool_]) -> Bits:
     return bits
 
 
+@njit(cache=True, nogil=True, inline="always")
+def on_board(row: Int, col: Int) -> bool:
+    """Return whether a cell of the grid has a square."""
+    return bool(1 <= row <= SIDE and 1 <= col <= SIDE)
+
+
 @njit(cache=True, nogil=True)
 def to_square(row: Int, col: Int) -> Int:
     """Return the square of a cell of the grid."""
     return (row - 1) * SIDE + col - 1
+
+
+@njit(cache=True, nogil=True)
+def squares_of(cells: NDArray[np.int64]) -> Bits:
+    """Return the set of (row, column) cells [K, 2]; those that are not on the board are absent."""
+    bits = NONE
+    for k in range(len(cells)):
+        if on_board(cells[k, 0], cells[k, 1]):
+            bits |= bit(to_square(cells[k, 0], cells[k, 1]))
+    return bits

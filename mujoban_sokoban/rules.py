@@ -1,7 +1,9 @@
 """The rules of Sokoban and the rewards of paper appendix B, on arrays.
 
 Player and boxes are (row, column); a box at a negative row is absent, which pads a batch of levels with different
-numbers of boxes. Boxes keep their order.
+numbers of boxes. Boxes keep their order. What may be walked and pushed is said by `bitboard`, for which the outermost
+cells are wall; a box there, as an uncertain estimate may have it, counts as absent, and a player there stays. A box in
+a wall does not move.
 
 Shapes: B levels, K boxes, N = `grid.GRID_SIZE`.
 """
@@ -14,7 +16,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from mujoban_core.grid import AGENT, BOX, OFFSETS_RC, TARGET, WALL, Instruction
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, TARGET, WALL, Instruction
+from mujoban_sokoban.bitboard import (
+    NONE,
+    SQUARE_STEP,
+    bit,
+    count,
+    from_grid,
+    on_board,
+    pushed,
+    squares_of,
+    stepped,
+    to_square,
+)
 
 BOX_REWARD: Final = 1.0
 """Reward of pushing a box onto a target, and penalty of pushing it off."""
@@ -40,22 +54,6 @@ class Transition(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _box_at(boxes: NDArray[np.int64], row: int, col: int) -> int:
-    for k in range(boxes.shape[0]):
-        if boxes[k, 0] == row and boxes[k, 1] == col:
-            return k
-    return -1
-
-
-@njit(cache=True, nogil=True)
-def _all_on_target(target: NDArray[np.bool_], boxes: NDArray[np.int64]) -> bool:
-    for k in range(boxes.shape[0]):  # noqa: SIM110 - numba has no all() over generators
-        if boxes[k, 0] >= 0 and not target[boxes[k, 0], boxes[k, 1]]:
-            return False
-    return True
-
-
-@njit(cache=True, nogil=True)
 def _apply_in_place(
     wall: NDArray[np.bool_],
     target: NDArray[np.bool_],
@@ -66,28 +64,32 @@ def _apply_in_place(
     solved: NDArray[np.bool_],
     moved: NDArray[np.bool_],
 ) -> None:
-    size = wall.shape[1]
     for i in range(player.shape[0]):
-        d_row, d_col = OFFSETS_RC[instruction[i], 0], OFFSETS_RC[instruction[i], 1]
-        row, col = player[i, 0] + d_row, player[i, 1] + d_col
-        solved[i] = _all_on_target(target[i], boxes[i])
-        if (d_row == 0 and d_col == 0) or not (0 <= row < size and 0 <= col < size) or wall[i, row, col]:
+        targets, box = from_grid(target[i]), squares_of(boxes[i])
+        solved[i] = box & ~targets == NONE
+        direction = np.int64(instruction[i]) - 1
+        if direction < 0 or not on_board(player[i, 0], player[i, 1]):
             continue
-        k = _box_at(boxes[i], row, col)
-        if k >= 0:
-            to_row, to_col = row + d_row, col + d_col
-            if not (0 <= to_row < size and 0 <= to_col < size):
-                continue
-            if wall[i, to_row, to_col] or _box_at(boxes[i], to_row, to_col) >= 0:
-                continue
-            boxes[i, k, 0], boxes[i, k, 1] = to_row, to_col
-            reward[i] = BOX_REWARD * (np.float32(target[i, to_row, to_col]) - np.float32(target[i, row, col]))
-            was_solved = solved[i]
-            solved[i] = _all_on_target(target[i], boxes[i])
-            if solved[i] and not was_solved:
-                reward[i] += SOLVED_REWARD
-        player[i, 0], player[i, 1] = row, col
+        here, floor = to_square(player[i, 0], player[i, 1]), ~from_grid(wall[i])
+        there = stepped(bit(here), floor & ~box, box & floor, direction)
+        if there == NONE:
+            continue
+        d_row, d_col = OFFSETS_RC[direction + 1, 0], OFFSETS_RC[direction + 1, 1]
+        player[i, 0] += d_row
+        player[i, 1] += d_col
         moved[i] = True
+        if there & box == NONE:
+            continue
+        for k in range(boxes.shape[1]):
+            if boxes[i, k, 0] == player[i, 0] and boxes[i, k, 1] == player[i, 1]:
+                boxes[i, k, 0] += d_row
+                boxes[i, k, 1] += d_col
+                break
+        after = pushed(box, here + SQUARE_STEP[direction], direction)
+        reward[i] = BOX_REWARD * np.float32(count(after & targets) - count(box & targets))
+        was_solved, solved[i] = solved[i], after & ~targets == NONE
+        if solved[i] and not was_solved:
+            reward[i] += SOLVED_REWARD
 
 
 def apply(
@@ -113,8 +115,9 @@ def apply(
         walls, targets, new_boxes, new_player = walls[None], targets[None], new_boxes[None], new_player[None]
         instructions = instructions[None]
     batch = len(new_player)
-    shapes = (walls.shape[:1], targets.shape, new_boxes.shape[:1], new_boxes.shape[2:], instructions.shape)
-    if walls.ndim != 3 or shapes != ((batch,), walls.shape, (batch,), (2,), (batch,)):
+    grids = (batch, GRID_SIZE, GRID_SIZE)
+    shapes = (walls.shape, targets.shape, new_boxes.shape[:1], new_boxes.shape[2:], instructions.shape)
+    if shapes != (grids, grids, (batch,), (2,), (batch,)):
         raise ValueError(
             f"wall {walls.shape}, target {targets.shape}, boxes {new_boxes.shape}, player {new_player.shape} and "
             f"instruction {instructions.shape}: expected [B, N, N], [B, N, N], [B, K, 2], [B, 2] and [B]"

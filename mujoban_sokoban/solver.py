@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mujoban_core.grid import GRID_SIZE, Instruction
 from mujoban_sokoban import solver_search
-from mujoban_sokoban.bitboard import to_square
+from mujoban_sokoban.bitboard import squares_of, to_square
 from mujoban_sokoban.levels import Level, LevelBatch, stack_levels
-from mujoban_sokoban.solver_labels import count_moves, label_batch, moves_of, search_batch, squares_of
+from mujoban_sokoban.solver_labels import count_moves, label_batch, moves_of, search_batch
 from mujoban_sokoban.solver_search import make_workspace
 
 MAX_NODES: Final = 250_000

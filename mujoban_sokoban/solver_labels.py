@@ -22,6 +22,7 @@ from mujoban_sokoban.bitboard import (
     pushed,
     shift,
     spread,
+    squares_of,
     to_square,
 )
 from mujoban_sokoban.solver_search import SOLVED, Workspace, search
@@ -112,16 +113,6 @@ def count_moves(
             moves[i] += distance[square - SQUARE_STEP[direction]] + 1
             occupied = pushed(occupied, square, direction)
             at = square
-
-
-@njit(cache=True, nogil=True)
-def squares_of(cells: NDArray[np.int64]) -> Bits:
-    """Return the set of (row, column) cells [K, 2]; those at a negative row are absent."""
-    bits = NONE
-    for k in range(len(cells)):
-        if cells[k, 0] >= 0:
-            bits |= bit(to_square(cells[k, 0], cells[k, 1]))
-    return bits
 
 
 @njit(cache=True, nogil=True)

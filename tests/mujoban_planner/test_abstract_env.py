@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mujoban_planner.abstract_env import STEP_REWARD, AbstractEnvironment
-from mujoban_planner.boards import abstract_states
-from mujoban_sokoban import rules
+from mujoban_planner.boards import abstract_states, likeliest_boards
+from mujoban_sokoban import bitboard, rules
 from mujoban_sokoban.generator import generate_batch, generate_level
 
 
@@ -18,6 +18,22 @@ def _environment(boards, **options):
 
 def _boards(difficulty, seed, n):
     return generate_batch(difficulty, range(seed, seed + n))
+
+
+@settings(max_examples=15, deadline=None)
+@given(difficulty=st.integers(1, 5), seed=st.integers(0, 10_000), actions=st.integers(0, 2**32 - 1))
+def test_moves_and_pushes_are_those_of_the_bitboard(difficulty, seed, actions):
+    env, rng = _environment(_boards(difficulty, seed, 16)), np.random.default_rng(actions)
+    for _ in range(60):
+        before, over, instruction = likeliest_boards(env.observe().numpy()), env.solved.numpy(), rng.integers(0, 5, 16)
+        env.step(torch.from_numpy(instruction))
+        after = likeliest_boards(env.observe().numpy())
+        for i in np.flatnonzero(~over & (instruction > 0)):
+            agent, box, direction = int(before.agent[i]), before.box[i], int(instruction[i]) - 1
+            there = bitboard.stepped(np.uint64(bitboard.bit(agent)), ~(before.wall[i] | box), box, direction)
+            to = int(after.agent[i])
+            assert there == (bitboard.NONE if to == agent else bitboard.bit(to))
+            assert after.box[i] == (bitboard.pushed(box, to, direction) if there & box else box)
 
 
 @settings(max_examples=15, deadline=None)

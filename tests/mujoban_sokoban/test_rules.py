@@ -82,6 +82,22 @@ def test_absent_boxes_change_nothing():
     assert after.boxes[1].tolist() == [-1, -1]
 
 
+def test_a_box_that_an_estimate_has_in_a_wall_does_not_move():
+    level = Level.from_text("######\n#@$. #\n######")
+    wall = level.wall.copy()
+    wall[tuple(level.boxes[0])] = True
+    assert not apply(wall, level.target, level.boxes, level.player, Instruction.EAST).moved
+
+
+def test_what_an_estimate_has_on_the_outermost_cells_is_ignored():
+    level = Level.from_text("######\n#@$. #\n######")
+    boxes = np.concatenate([level.boxes, [[0, 0], [9, 5]]])
+    after = apply(level.wall, level.target, boxes, level.player, Instruction.EAST)
+    assert after.solved and after.boxes[1:].tolist() == [[0, 0], [9, 5]]
+    for corner in ([0, 4], [9, 9]):
+        assert not apply(~level.wall, level.target, boxes, corner, Instruction.SOUTH).moved
+
+
 @pytest.mark.parametrize("bad", [-1, 5])
 def test_an_unknown_instruction_is_refused(bad):
     with pytest.raises(ValueError, match=r"0\.\.4"):
