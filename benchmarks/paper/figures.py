@@ -14,8 +14,10 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 from benchmarks.paper import runs as sources
+from benchmarks.paper.baselines import BASELINES, points_of
 from benchmarks.paper.curves import MODULES
 from benchmarks.paper.runs import ResultError, Run, is_stale, load
+from mujoban_core.grid import DIFFICULTIES
 
 _COLUMNS: Final = 4
 
@@ -25,7 +27,7 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
     reports = [(run, report) for run in runs if (report := load(run)) is not None]
     if not reports:
         return False
-    figure, axes = plt.subplots(figsize=(5, 3.2), layout="constrained")
+    figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
     for stale, label in ((False, "Mujoban, fully learned"), (True, "the same with other weights than ship now")):
         chosen = [(run, report) for run, report in reports if is_stale(report) == stale]
         if chosen:
@@ -36,12 +38,41 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
                 x, y, yerr=[low, high], capsize=3, label=label, marker="o", color="tab:blue",
                 linestyle="none" if stale else "-", markerfacecolor="white" if stale else "tab:blue",
             )  # fmt: skip
+    for row in BASELINES:
+        measured = [(d, report) for d in DIFFICULTIES if (report := load(row.run(d))) is not None]
+        if measured:
+            rates = [report["success_rate"] for _, report in measured]
+            margins = list(zip(*(_margins(report) for _, report in measured), strict=True))
+            label = f"{row.title} ({row.levels})"
+            x = [d for d, _ in measured]
+            axes.errorbar(x, rates, yerr=margins, capsize=2, marker=".", linewidth=1, label=label)
     paper = [(run.difficulty, run.paper_success) for run, _ in reports if run.paper_success is not None]
     if paper:
         axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, Table 1", zorder=3)
     axes.set(xlabel="difficulty", ylabel="success rate", ylim=(0, 1.02), xticks=range(1, 6))
-    axes.legend(loc="lower left")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small")
     figure.savefig(file, dpi=120)
+    plt.close(figure)
+    return True
+
+
+def baseline_curves(file: Path) -> bool:
+    """Draw success and return of the baselines in training against steps; return False when there is no curve."""
+    found = [(row, points) for row in BASELINES if (points := points_of(row))]
+    if not found:
+        return False
+    figure, panels = plt.subplots(2, len(DIFFICULTIES), figsize=(14, 5), layout="constrained", sharex=True)
+    for (axes_solved, axes_return), d in zip(panels.T, DIFFICULTIES, strict=True):
+        for axes, kind in ((axes_solved, "solved"), (axes_return, "return")):
+            for row, points in found:
+                seen = [(p["step"], p[kind][str(d)]) for p in points if str(d) in p[kind]]
+                if seen:
+                    axes.plot(*zip(*seen, strict=True), label=f"{row.title} ({row.levels})")
+            axes.set(ylabel=kind, xlabel="environment steps")
+        axes_solved.set_title(f"difficulty {d}")
+    handles = {name: h for axes in panels.flat for h, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize="small")
+    figure.savefig(file, dpi=110)
     plt.close(figure)
     return True
 

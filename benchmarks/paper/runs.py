@@ -43,6 +43,8 @@ class Run:
     paper_success: float | None = None
     """Success rate in the paper's Table 1 or 2."""
     paper_reward: float | None = None
+    agent: Path | None = None
+    """Weights of an agent that plays in the place of the stack."""
 
     @property
     def file(self) -> Path:
@@ -57,7 +59,8 @@ class Run:
     def options(self) -> list[str]:
         """Return the options of `bringup/evaluate.py` but for levels, seed and report."""
         oracle = ["--oracle", ",".join(self.oracle)] if self.oracle else []
-        return ["--difficulty", str(self.difficulty), *oracle]
+        agent = [] if self.agent is None else ["--agent", str(self.agent)]
+        return ["--difficulty", str(self.difficulty), *oracle, *agent]
 
 
 SENSE: Final = ("estimator", "termination")
@@ -144,16 +147,20 @@ class Options:
 def rerun(options: Options) -> None:
     """Rerun the evaluations."""
     # Imported here: both need the definitions above.
-    from benchmarks.paper import film, parts
+    from benchmarks.paper import baselines, film, parts
 
-    names = [*(run.name for run in ALL), film.NAME]
+    every = (*ALL, *baselines.RUNS)
+    names = [*(run.name for run in every), film.NAME]
     unknown = set(options.only) - set(names)
     if unknown:
         raise ValueError(f"--only {', '.join(sorted(unknown))}: expected some of {', '.join(names)}")
     JSON.mkdir(parents=True, exist_ok=True)
     chosen = options.only or tuple(names)
-    for run in ALL:
+    for run in every:
         if run.name not in chosen:
+            continue
+        if run.agent is not None and not run.agent.is_file():
+            print(f"{run.name}: no weights at {run.agent} yet (docs/baselines.md)", flush=True)
             continue
         if is_current(run, options.episodes) and not options.again:
             print(f"{run.name}: measured already with these weights (--again measures anew)", flush=True)

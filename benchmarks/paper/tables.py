@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.paper.runs import Run, is_stale, load
+from benchmarks.paper.baselines import BASELINES, points_of
+from benchmarks.paper.runs import DIFFICULTY, Run, is_stale, load
+from mujoban_core.grid import DIFFICULTIES
 
 STALE = " †"
 """Marks a result of other weights than those that ship now."""
@@ -39,6 +41,33 @@ def test_uses(runs: Sequence[Run]) -> str:
     unknown = sum(entries is None for entries in uses)
     before = f"; {unknown} of the rows were measured before uses were counted" if unknown else ""
     return f"The test levels were used {counted} times for these rows{before}.\n"
+
+
+def baselines(modular: Run) -> str:
+    """Return Table 1: the modular stack and the agents that it is compared with, with what each was trained on."""
+    header = ["agent", "sees", "trained on", "steps", "CPU hours", "n", *(f"difficulty {d}" for d in DIFFICULTIES)]
+    rows = [["modular", "o_cam, o_pr, o_pos", "hard", MISSING, MISSING, *_rates([*DIFFICULTY[:-1], modular])]]
+    for row in BASELINES:
+        points = points_of(row)
+        steps = f"{points[-1]['step'] / 1e6:.2f} M" if points else MISSING
+        hours = f"{points[-1]['cpu_seconds'] / 3600:.1f}" if points else MISSING
+        rows.append([row.title, row.sees, row.levels, steps, hours, *_rates([row.run(d) for d in DIFFICULTIES])])
+    return _table(header, rows)
+
+
+def _rates(runs: Sequence[Run]) -> list[str]:
+    """Return the number of levels, and success with its interval at each difficulty."""
+    reports = [load(run) for run in runs]
+    counts = {len(report["episodes"]) for report in reports if report}
+    cells = []
+    for report in reports:
+        if report is None:
+            cells.append(MISSING)
+            continue
+        low, high = report["success_interval"]
+        stale = STALE if is_stale(report) else ""
+        cells.append(f"{100 * report['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f}){stale}")
+    return ["/".join(map(str, sorted(counts))) or "0", *cells]
 
 
 def _row(run: Run, report: dict[str, Any] | None) -> list[str]:

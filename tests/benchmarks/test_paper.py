@@ -1,11 +1,12 @@
 """Tables and figures of the paper: rebuilt from JSON, marked when stale, missing sources named with their command."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from benchmarks.paper import __main__ as results
-from benchmarks.paper import curves, film, parts, runs, tables
+from benchmarks.paper import baselines, curves, film, parts, runs, tables
 from bringup.command import Choice, Stack
 from bringup.results import EpisodeResult, report, write_report
 from mujoban_core.files import digest
@@ -107,3 +108,26 @@ def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
         curves.read_curve("planner", [tmp_path / "first"])
     with pytest.raises(runs.ResultError, match="missing: expected the run directory"):
         curves.read_curve("planner", [tmp_path / "missing"])
+
+
+def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
+    lines = [
+        {"step": 1000 * i, "cpu_seconds": 360.0 * i, "solved/1": i / 10, "return/1": float(i), "solved/5": None}
+        for i in range(1, 11)
+    ]
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert baselines.main([f"mpo_easy={tmp_path / 'run'}"]) == 0
+    row = next(row for row in baselines.BASELINES if row.name == "mpo_easy")
+    cost = {"step": 10_000, "cpu_seconds": 3600}
+    assert baselines.points_of(row)[-1] == {**cost, "solved": {"1": 1.0}, "return": {"1": 10.0}}
+    write(row.run(1), 3, 4, {"agent": "a" * 64})
+    page = Path(results.rebuild(results.Options(folder))).read_text()
+    rates = "75.0 % (30.1 to 95.4) | - | - | - | -"
+    assert f"| MPO, asym. | o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 4 | {rates} |" in page
+    assert (folder / "baselines.png").stat().st_size and "--agent" in row.run(1).options()
+    with pytest.raises(ValueError, match="nobody=x: expected NAME=RUN with a name among mpo_hard"):
+        baselines.main(["nobody=x"])
+    row.curve.write_text("{}\n")
+    with pytest.raises(runs.ResultError, match="rerun python -m benchmarks.paper.baselines mpo_easy"):
+        results.rebuild(results.Options(folder))

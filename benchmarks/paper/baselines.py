@@ -1,0 +1,152 @@
+"""The other rows of Table 1 and curves of Figure 2: agents without modules, from the runs that trained them.
+
+    python -m benchmarks.paper.baselines mpo_easy=runs/baselines/mpo_easy ...     # note what a run cost, and its curve
+    python -m benchmarks.paper.runs --only mpo_easy_1 mpo_easy_5                  # evaluate its weights
+
+The first writes `baseline_<name>.jsonl`, an object a line with `step`, `cpu_seconds`, and `solved` and `return` of the
+episodes that were played in training, by difficulty.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import tyro
+
+from benchmarks.paper import runs as sources
+from benchmarks.paper.runs import ROOT, ResultError, Run
+from mujoban_core.files import write_atomically
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.program import read_options, run_command
+
+PROG: Final = "benchmarks.paper.baselines"
+_MOST: Final = 100
+"""Points of a curve; more are averaged."""
+_KINDS: Final = ("solved", "return")
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A row of Table 1."""
+
+    name: str
+    title: str
+    sees: str
+    levels: str
+    """What it is trained on."""
+    method: str
+    """Arguments of `python -m mujoban_baselines.train`, but for the run directory."""
+
+    @property
+    def weights(self) -> Path:
+        """Where its run is expected to leave its weights."""
+        return ROOT / "runs" / "baselines" / self.name / "agent.safetensors"
+
+    @property
+    def command(self) -> str:
+        """The command that trains it."""
+        return f"python -m mujoban_baselines.train {self.method} --run runs/baselines/{self.name}"
+
+    @property
+    def curve(self) -> Path:
+        """Where its learning curve lies."""
+        return sources.JSON / f"baseline_{self.name}.jsonl"
+
+    def run(self, difficulty: int) -> Run:
+        """Return its evaluation at a difficulty."""
+        return Run(f"{self.name}_{difficulty}", self.title, difficulty, agent=self.weights)
+
+
+_ROBOT, _ABOVE = "o_cam, o_pr, o_pos", "o_top, o_pr"
+BASELINES: Final = (
+    Baseline("mpo_hard", "MPO, asym.", _ROBOT, "hard", "monolithic-mpo"),
+    Baseline("mpo_hard_sym", "MPO, sym.", _ROBOT, "hard", "monolithic-mpo --critic symmetric"),
+    Baseline("mpo_curriculum", "MPO, asym.", _ROBOT, "curriculum", "monolithic-mpo --levels curriculum"),
+    Baseline("mpo_easy", "MPO, asym.", _ROBOT, "easy", "monolithic-mpo --levels easy"),
+    Baseline(
+        "mpo_cloned", "MPO, asym., after cloning the stack", _ROBOT, "curriculum",
+        "monolithic-mpo --levels curriculum --mpo.critic-first 1000 --start runs/baselines/clone/agent.safetensors",
+    ),
+    Baseline("clone", "cloning of the stack alone", _ROBOT, "bags", "clone --bags bags/stack"),
+    Baseline("vtrace", "V-trace", _ABOVE, "curriculum", "monolithic-vtrace"),
+    Baseline("structured", "structured V-trace", f"{_ABOVE}, s_abst", "curriculum", "structured-vtrace"),
+)  # fmt: skip
+"""The agents of appendix D, and a monolithic one that may copy."""
+RUNS: Final = tuple(baseline.run(d) for baseline in BASELINES for d in DIFFICULTIES)
+"""Their evaluations."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Note what runs cost, and their learning curves."""
+
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="NAME=RUN")]
+    """Names of baselines and their run directories."""
+
+
+def read_curve(run: Path) -> list[dict[str, Any]]:
+    """Return at most `_MOST` points of a run, each the mean over a stretch of it.
+
+    Raises:
+        ResultError: If it has no metrics.
+    """
+    try:
+        lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    except (OSError, json.JSONDecodeError) as error:
+        raise ResultError(f"{run}: expected the run directory of a trainer ({error})") from error
+    if not lines:
+        raise ResultError(f"{run}: its metrics are empty")
+    points = []
+    for part in np.array_split(np.array(lines, object), min(len(lines), _MOST)):
+        point: dict[str, Any] = {"step": part[-1]["step"], "cpu_seconds": round(part[-1].get("cpu_seconds") or 0.0)}
+        for kind in _KINDS:
+            seen = {d: [line[f"{kind}/{d}"] for line in part if f"{kind}/{d}" in line] for d in DIFFICULTIES}
+            known = {str(d): [value for value in values if value is not None] for d, values in seen.items()}
+            point[kind] = {d: round(float(np.mean(values)), 4) for d, values in known.items() if values}
+        points.append(point)
+    return points
+
+
+def points_of(baseline: Baseline) -> list[dict[str, Any]]:
+    """Return the points of a baseline's learning curve; none where there is no file.
+
+    Raises:
+        ResultError: If the file is not what this program writes.
+    """
+    if not baseline.curve.exists():
+        return []
+    try:
+        points = [json.loads(line) for line in baseline.curve.read_text().splitlines()]
+        if any({"step", "cpu_seconds", *_KINDS} - point.keys() for point in points):
+            raise ValueError("a point lacks a value")
+    except ValueError as error:
+        again = f"python -m {PROG} {baseline.name}=runs/baselines/{baseline.name}"
+        raise ResultError(f"{baseline.curve}: {error}; rerun {again}") from error
+    return points
+
+
+def note(given: Sequence[str]) -> None:
+    """Write the curves of runs, given as NAME=RUN."""
+    known = {baseline.name: baseline for baseline in BASELINES}
+    for text in given:
+        name, equals, run = text.partition("=")
+        if not equals or name not in known:
+            raise ValueError(f"{text}: expected NAME=RUN with a name among {', '.join(known)}")
+        points = read_curve(Path(run))
+        write_atomically(known[name].curve, "".join(json.dumps(point) + "\n" for point in points).encode())
+        print(f"{known[name].curve.name}: {len(points)} points, {points[-1]['step']} steps")
+
+
+def main(command_line: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    note(read_options(Options, command_line, PROG, __doc__).runs)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(PROG, main)
