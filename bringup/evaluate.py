@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 from tyro.conf import arg
 
-from bringup.command import Player, Stack, import_from_here
+from bringup.command import Player, import_from_here
 from bringup.options import HERE, ClusterOptions, Count, EpisodeOptions, FilePath, PlayerOptions
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_file
@@ -48,8 +48,6 @@ class Options:
         """Reject what contradicts itself."""
         if self.graph and self.shared.cluster:
             raise ValueError("--graph --cluster: expected one of the two, since the graph plays on this machine")
-        if self.graph and self.modules.agent is not None:
-            raise ValueError(f"--agent {self.modules.agent} --graph: expected one of the two")
 
 
 def evaluate(
@@ -124,7 +122,7 @@ def _play(
             reporting.results = results
             bar.show(results)
 
-        if isinstance(stack, Stack) and options.graph:
+        if options.graph:
             from bringup.stack import PlayOptions
             from bringup.stack import play as play_graph
 

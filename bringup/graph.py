@@ -18,8 +18,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from bringup.parameters import Parameters, write_parameters
+from mujoban_baselines.node import AgentNode
 from mujoban_controller.node import ControllerNode
 from mujoban_core import children
+from mujoban_core.plugins import AGENT
 from mujoban_core.program import USAGE_ERROR
 from mujoban_estimator.node import EstimatorNode
 from mujoban_estimator.termination_node import TerminationNode
@@ -39,11 +41,17 @@ NODES: dict[str, type[GraphNode]] = {
     "controller": ControllerNode,
 }
 """The nodes of the graph by name."""
+ALONE: dict[str, type[GraphNode]] = {"simulator": SimulatorNode, AGENT: AgentNode}
+"""Those of a graph in which an agent plays alone."""
 
 RESPAWN_PERIOD = 0.1
 """Seconds between two looks at whether the processes live."""
 RESTART_LIMIT = 20
 """Times that a node is started again before the graph is given up."""
+
+
+def _kind(name: str) -> type[GraphNode]:
+    return {**NODES, **ALONE}[name]
 
 
 class GraphError(ValueError):
@@ -52,8 +60,8 @@ class GraphError(ValueError):
 
 def keep_memories(parameters: Parameters, folder: Path) -> None:
     """Have each node keep in a folder what it needs to go on from where it was, when it is started again."""
-    for name in NODES:
-        parameters[name]["resume_file"] = str(folder / f"{name}.safetensors")
+    for name, values in parameters.items():
+        values["resume_file"] = str(folder / f"{name}.safetensors")
 
 
 class InProcess:
@@ -99,7 +107,7 @@ class InProcess:
     def start(self, name: str) -> None:
         """Start a node of the graph."""
         overrides = [Parameter(key, value=value) for key, value in self._parameters[name].items()]
-        self.nodes[name] = NODES[name](parameter_overrides=overrides, context=self._context)
+        self.nodes[name] = _kind(name)(parameter_overrides=overrides, context=self._context)
         self.executor.add_node(self.nodes[name])
 
     def stop(self, name: str) -> None:
@@ -140,7 +148,7 @@ class Processes:
         keep_memories(parameters, self._folder.path)
         self._parameter_file = self._folder.path / "parameters.yaml"
         write_parameters(parameters, self._parameter_file)
-        self._children = {name: self._start(name) for name in NODES}
+        self._children = {name: self._start(name) for name in parameters}
 
     def __enter__(self) -> Processes:
         """Return these processes."""
@@ -190,5 +198,5 @@ class Processes:
         self._folder.remove()
 
     def _start(self, name: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", NODES[name].__module__, "--ros-args"]
+        command = [sys.executable, "-m", _kind(name).__module__, "--ros-args"]
         return children.start([*command, "--params-file", str(self._parameter_file)])

@@ -16,6 +16,7 @@ from rclpy.task import Future
 from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
 from mujoban_core.grid import CHANNELS, GRID_SIZE
+from mujoban_core.plugins import AGENT
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import LOG_PERIOD, PublisherWatch, Received, listen
@@ -29,6 +30,9 @@ ANOTHER_RUN: Final = "messages of another run"
 _AHEAD: Final = 100 * topics.TICK
 """Simulated time [ns] by which modules may be heard before the simulator; what is further ahead is a stranger's."""
 _WATCHED = (topics.INSTRUCTION, topics.TERMINATION, topics.ABSTRACT_STATE, topics.TRUE_ABSTRACT_STATE)
+"""What tells what the modules decided."""
+_WATCHED_ALONE = (topics.TORQUE, topics.TRUE_ABSTRACT_STATE)
+"""What there is to watch of an agent without modules."""
 
 
 class Watched(NamedTuple):
@@ -70,8 +74,16 @@ class MonitorNode(Node):
         counts: Events that a user should know of.
     """
 
-    def __init__(self, episodes: Episodes, **options: Unpack[NodeOptions]) -> None:
-        """Watch until as many episodes have ended; what another run says of its own is no result of this one."""
+    def __init__(
+        self, episodes: Episodes, *, alone: bool = False, **options: Unpack[NodeOptions]
+    ) -> None:
+        """Watch until as many episodes have ended; what another run says of its own is no result of this one.
+
+        Args:
+            episodes: Which are played.
+            alone: Whether an agent plays alone, without modules.
+            **options: Of the node.
+        """
         super().__init__("monitor", **options)
         self.episode: EpisodeTruth | None = None
         self.latest: Watched | None = None
@@ -81,17 +93,18 @@ class MonitorNode(Node):
         self.counts: Counter[str] = Counter()
         self._episodes = episodes
         self._started = self._ended = 0.0
-        self._join = Synchroniser([t.name for t in _WATCHED], depth=64)
+        watched = _WATCHED_ALONE if alone else _WATCHED
+        self._join = Synchroniser([t.name for t in watched], depth=64)
         self._log = EpisodeLog(0)
         self._sequence = 0
         self._joined = -1
         self._end: EpisodeTruth | None = None
         qos = live_qos(depth=1024)
         listen(self, topics.TRUE_EPISODE, self._on_episode, qos=qos, decode=checked(topics.TRUE_EPISODE))
-        for topic in _WATCHED:
+        for topic in watched:
             steady = topic == topics.TRUE_ABSTRACT_STATE
             listen(self, topic, partial(self._receive, topic.name), qos=qos, steady=steady)
-        self.watch = PublisherWatch(self)
+        self.watch = PublisherWatch(self, topics.PUBLISHERS | ({topics.TORQUE.name: AGENT} if alone else {}))
 
     @property
     def stamp(self) -> int:
@@ -144,8 +157,8 @@ class MonitorNode(Node):
     def _on_tick(self, tick: Watched) -> None:
         self.latest = tick
         self.ticks += 1
-        said = tick.instruction
-        if said.sequence != self._sequence:
+        said = tick.instruction if topics.INSTRUCTION.name in tick.values else None
+        if said is not None and said.sequence != self._sequence:
             self._sequence = said.sequence
             self._log.decided(tick.truth, tick.estimate, said.direction, tick.termination.timed_out)
         self._finish_when_joined()

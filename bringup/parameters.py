@@ -7,9 +7,9 @@ from typing import Any
 
 import yaml
 
-from bringup.command import Stack
+from bringup.command import Choice, Player, Solo
 from mujoban_core.look_around import LOOKING_ROLES
-from mujoban_core.plugins import ROLES
+from mujoban_core.plugins import AGENT, ROLES
 from mujoban_sokoban.episodes import Episodes
 
 DEFAULTS = Path(__file__).parent / "config" / "stack.yaml"
@@ -37,11 +37,11 @@ def write_parameters(parameters: Parameters, path: Path) -> None:
     path.write_text(yaml.safe_dump({node: {"ros__parameters": values} for node, values in parameters.items()}))
 
 
-def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Parameters:
-    """Return the parameters of a graph that plays some episodes with some modules.
+def graph_parameters(stack: Player, episodes: Episodes, **simulator: Any) -> Parameters:
+    """Return the parameters of a graph that plays some episodes with some modules, or with an agent alone.
 
     Args:
-        stack: The modules.
+        stack: The modules, or the agent.
         episodes: The episodes.
         **simulator: Further parameters of the simulator.
     """
@@ -55,14 +55,11 @@ def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Para
     }
     if episodes.level_file is None:
         parameters["simulator"]["difficulty"] = episodes.difficulty
+    if isinstance(stack, Solo):
+        parameters["simulator"]["instructed"] = False
+        return {"simulator": parameters["simulator"], AGENT: _loaded(stack.choice, stack)}
     for role in ROLES:
-        choice = stack.choices[role]
-        parameters[role] |= {
-            "module": choice.source,
-            "weights": "" if choice.weights is None else str(choice.weights),
-            "device": stack.device,
-            "threads": stack.threads,
-        }
+        parameters[role] |= _loaded(stack.choices[role], stack)
     for role in LOOKING_ROLES:
         parameters[role]["look_around"] = stack.look_around_ticks
     parameters["planner"] |= {
@@ -71,3 +68,13 @@ def graph_parameters(stack: Stack, episodes: Episodes, **simulator: Any) -> Para
         "scout_weights": "" if stack.scout.weights is None else str(stack.scout.weights),
     }
     return parameters
+
+
+def _loaded(choice: Choice, player: Player) -> dict[str, Any]:
+    """Return the parameters that say what a node loads, and how."""
+    return {
+        "module": choice.source,
+        "weights": "" if choice.weights is None else str(choice.weights),
+        "device": player.device,
+        "threads": player.threads,
+    }

@@ -15,9 +15,9 @@ import rclpy
 from rclpy.executors import Executor
 from rclpy.parameter import Parameter
 
-from bringup.command import Stack, check_body
+from bringup.command import Player, Solo, check_body
 from bringup.domain import claim_domain
-from bringup.graph import NODES, RESPAWN_PERIOD, GraphError, InProcess, Processes
+from bringup.graph import RESPAWN_PERIOD, GraphError, InProcess, Processes
 from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
@@ -25,7 +25,7 @@ from bringup.results import EpisodeResult
 from bringup.video import EDGE, VideoNode
 from mujoban_core import children
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.plugins import ROLES
+from mujoban_core.plugins import AGENT, ROLES
 from mujoban_core.signals import StopSignal
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
@@ -71,7 +71,7 @@ class Outcome:
 
 
 def play(
-    stack: Stack,
+    stack: Player,
     episodes: Episodes,
     options: PlayOptions | None = None,
     *,
@@ -81,7 +81,7 @@ def play(
     """Play episodes through the graph.
 
     Args:
-        stack: The modules.
+        stack: The modules, or an agent.
         episodes: The episodes.
         options: How the graph is run; in lockstep and in this process by default.
         on_refresh: Called every `refresh_period` seconds with what the graph is doing.
@@ -109,10 +109,11 @@ def play(
         exits.enter_context(claim_domain())
         init_ros()
         exits.callback(rclpy.try_shutdown)
-        graph = exits.enter_context(InProcess(parameters, () if options.processes else NODES))
-        for role in () if options.processes else ROLES:
+        graph = exits.enter_context(InProcess(parameters, () if options.processes else parameters))
+        alone = isinstance(stack, Solo)
+        for role in () if options.processes else (AGENT,) if alone else ROLES:
             check_body(role, graph.nodes[role].module, stack.body)  # pyright: ignore[reportAttributeAccessIssue]
-        monitor = graph.add(MonitorNode(episodes))
+        monitor = graph.add(MonitorNode(episodes, alone=alone))
         stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:

@@ -8,7 +8,7 @@ the graph: `PublisherWatch` names them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -114,9 +114,9 @@ class PublisherWatch:
             were killed stay known for `LEASE` seconds.
     """
 
-    def __init__(self, node: Node) -> None:
-        """Look on behalf of a node, every `WATCH_PERIOD` seconds."""
-        self._node = node
+    def __init__(self, node: Node, publishers: Mapping[str, str] = PUBLISHERS) -> None:
+        """Look on behalf of a node, every `WATCH_PERIOD` seconds, at topics and the nodes that publish on them."""
+        self._node, self._publishers = node, publishers
         self._looks = 0
         self._counts: dict[str, int] = {}
         self._nameless: Counter[str] = Counter()
@@ -130,8 +130,8 @@ class PublisherWatch:
         self.seen |= new
         for name in sorted({name for _, name in new}):
             _count(self._node, "foreign publishers")
-            their = ", ".join(sorted(f"{topic} (of /{PUBLISHERS[topic]})" for topic, n in new if n == name))
-            second = "a second " if all(name == f"/{PUBLISHERS[topic]}" for topic, n in new if n == name) else ""
+            their = ", ".join(sorted(f"{topic} (of /{self._publishers[topic]})" for topic, n in new if n == name))
+            second = "a second " if all(name == f"/{self._publishers[topic]}" for topic, n in new if n == name) else ""
             self._node.get_logger().error(
                 f"foreign publisher: {second}node {name} publishes on {their}; the run may be disturbed. Stop it, or "
                 "give it another ROS_DOMAIN_ID"
@@ -139,12 +139,12 @@ class PublisherWatch:
 
     def _foreign(self, topic: str) -> set[str]:
         """Return the nodes that publish on a topic and have no business there."""
-        own = f"/{PUBLISHERS[topic]}"
+        own = f"/{self._publishers[topic]}"
         names = Counter(
             f"{info.node_namespace.rstrip('/')}/{info.node_name}"
             for info in self._node.get_publishers_info_by_topic(topic)
         )
-        if names[own] <= 1 + self.ghosts(PUBLISHERS[topic]):
+        if names[own] <= 1 + self.ghosts(self._publishers[topic]):
             del names[own]
         # Who has only just come, or is going, is not known by name for a moment.
         self._nameless[topic] = self._nameless[topic] + 1 if names[_NAMELESS] else 0
@@ -154,7 +154,7 @@ class PublisherWatch:
 
     def _topics(self) -> list[str]:
         """Return the topics whose publishers may be others than at the last look, or were not all known."""
-        counts = {topic: self._node.count_publishers(topic) for topic in PUBLISHERS}
+        counts = {topic: self._node.count_publishers(topic) for topic in self._publishers}
         every = self._looks % _THOROUGH == 0
         changed = [t for t, n in counts.items() if every or n != self._counts.get(t) or n > 1 or self._nameless[t]]
         self._looks, self._counts = self._looks + 1, counts

@@ -47,6 +47,7 @@ PARAMETERS: dict[str, Any] = {
     "realtime": 0.0,
     "resend_after": 0.5,
     "await_recorder": False,
+    "instructed": True,
     "top_camera_size": 256,
     "resume_file": "",
 }
@@ -68,6 +69,7 @@ class SimulatorNode(Node):
         realtime: Simulated seconds per second; 0 is lockstep.
         resend_after: Seconds without an answer after which a tick is offered again in lockstep.
         await_recorder: Whether in lockstep a recorder must have acknowledged a tick before the next.
+        instructed: Whether instructions come with the torques; those who play without modules send torques alone.
         top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
         resume_file: Where the node keeps every tick that it offers, so that it goes on from there after it was killed;
             empty means nowhere.
@@ -171,7 +173,8 @@ class SimulatorNode(Node):
     def _start_when_complete(self) -> None:
         """Begin once the modules listen and answer, and the recorder as well if one is awaited."""
         recorded = self._settings["await_recorder"]
-        needed = (topics.TORQUE, topics.INSTRUCTION, *([topics.RECORDED] if recorded else []))
+        instructions = [topics.INSTRUCTION] if self._settings["instructed"] else []
+        needed = (topics.TORQUE, *instructions, *([topics.RECORDED] if recorded else []))
         answering = all(self.count_publishers(topic.name) for topic in needed)
         if not (answering and self._observation.matched(everything=recorded)):
             return
@@ -244,7 +247,8 @@ class SimulatorNode(Node):
     @property
     def _answered(self) -> bool:
         """Whether nothing is missing to go on; an episode's last tick needs no answer."""
-        return self._recorded and (self._ended or (self._torque is not None and self._instruction is not None))
+        told = self._instruction is not None or not self._settings["instructed"]
+        return self._recorded and (self._ended or (self._torque is not None and told))
 
     def _proceed(self) -> None:
         """In lockstep, go on as soon as the tick has been answered."""

@@ -6,6 +6,7 @@ import pytest
 from bringup.command import Choice, Solo
 from bringup.evaluate import evaluate, main
 from bringup.results import Failure
+from bringup.stack import PlayOptions, play
 from mujoban_core.agent import Agent, AgentInput, AgentPolicy
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_sokoban.episodes import Episodes
@@ -112,3 +113,23 @@ def test_contradictions_and_unknown_agents_are_one_line():
         Solo(Choice.parse("agent", "random"), body="ant").policy()
     with pytest.raises(ValueError, match=r"expected a \.safetensors file"):
         Solo(Choice.parse("agent", "learned")).policy()
+
+
+def test_an_agent_plays_through_the_graph_as_it_does_in_a_rollout():
+    episodes = Episodes(2, 3, difficulty=1)
+    for name in ("random", f"{__name__}:MapReader"):
+        solo = Solo(Choice.parse("agent", name))
+        outcome = play(solo, episodes, PlayOptions(time_limit=25))
+        assert outcome.results == evaluate(solo.policy(), episodes, time_limit=25)
+        assert outcome.ticks == 50 and not any("foreign" in event for event in outcome.counts)
+
+
+class MapReader(Eastward):
+    """Drives by the true map: privileged."""
+
+    sees = ("pose", "abstract_state", "top_down")
+
+    def step(self, inputs: AgentInput, state):
+        assert inputs.top_down.shape == (1, 64, 64, 3) or len(inputs.pose) > 1
+        torque, state = super().step(inputs, state)
+        return torque * inputs.abstract_state[..., 1].any((1, 2))[:, None], state

@@ -161,7 +161,7 @@ def test_one_command_trains_each_module_and_names_what_it_does_not_know(capfd, m
 
 def test_what_cannot_be_trained_is_one_line(capfd):
     assert run(train, "oracle") == 2
-    assert capfd.readouterr().err == "command: error: module oracle, expected controller|planner|estimator\n"
+    assert capfd.readouterr().err == "command: error: module oracle, expected controller|planner|estimator|baselines\n"
 
 
 def test_the_installed_commands_are_the_programs():
