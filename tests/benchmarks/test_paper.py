@@ -129,5 +129,5 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
     with pytest.raises(ValueError, match="nobody=x: expected NAME=RUN with a name among mpo_hard"):
         baselines.main(["nobody=x"])
     row.curve.write_text("{}\n")
-    with pytest.raises(runs.ResultError, match="rerun python -m benchmarks.paper.baselines mpo_easy"):
+    with pytest.raises(runs.ResultError, match=r"rerun python -m benchmarks\.paper\.baselines mpo_easy"):
         results.rebuild(results.Options(folder))
