@@ -169,9 +169,9 @@ class LessonsAndBags(Source[Batch]):
         self._bags.restore(state.part("bags"))
 
     def worker_cpu_seconds(self) -> float:
-        """Return the CPU time of the process beside."""
+        """Return the CPU time of those who make lessons."""
         return self._lessons.worker_cpu_seconds()
 
     def close(self) -> None:
-        """End the process beside."""
+        """End those who make lessons."""
         self._lessons.close()

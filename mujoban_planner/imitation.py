@@ -5,10 +5,10 @@ Shapes: B batch, N = `grid.GRID_SIZE`, I = N - 2, A = 5 instructions.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,11 @@ from torch.nn import functional
 
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import start_from
-from mujoban_planner.lesson_source import LessonConfig, LessonSource
+from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch
 from mujoban_planner.validation import NetworkConfig, success_rates
+from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
@@ -171,7 +172,7 @@ class ImitationLearner(Learner[Batch]):
 
 def imitation(
     config: ImitationConfig, directory: Path, cadence: Cadence | None = None, *, device: str = "cpu",
-    processes: int = 1, bags: Sequence[Path] = (),
+    actors: ActorOptions | None = None, bags: Sequence[Path] = (),
 ) -> Trainer[Batch]:  # fmt: skip
     """Open or resume a run.
 
@@ -180,7 +181,7 @@ def imitation(
         directory: Run directory.
         cadence: How often it evaluates and saves.
         device: Device of the network.
-        processes: 1 to make lessons in a process beside, 0 to make them in between (a run is then deterministic).
+        actors: Where lessons are made; in between by default.
         bags: Recorded bags, or folders of bags, whose decisions are labelled and join the batches.
 
     Raises:
@@ -189,8 +190,7 @@ def imitation(
     """
     run = RunDirectory(directory, config)
     learner = ImitationLearner(config, device)
-    beside = run.path / "played.safetensors" if processes else None
-    source = _source(config, copy.deepcopy(learner.average), beside, bags)
+    source = _source(config, actors or ActorOptions(), bags)
     training = asdict(config)
     if math.isinf(config.horizon_seconds):
         training["horizon_seconds"] = None
@@ -205,17 +205,19 @@ def imitation(
     return Trainer(run, learner, source, budget, cadence, record=record)
 
 
-def _source(
-    config: ImitationConfig, player: LearnedPlanner, beside: Path | None, bags: Sequence[Path]
-) -> Source[Batch]:
+def _source(config: ImitationConfig, actors: ActorOptions, bags: Sequence[Path]) -> Source[Batch]:
     """Return lessons, decisions from bags, or both."""
     if not bags:
-        return LessonSource(config, player, beside)
+        return _lessons(config, actors)
     recorded = round(config.bag_share * config.batch_size)
     found = BagLessons(Lessons.read(bags, config.seed), max(recorded, 1), config.bag_estimates, config.seed)
     if recorded >= config.batch_size:
         return found
-    return LessonsAndBags(LessonSource(replace(config, batch_size=config.batch_size - recorded), player, beside), found)
+    return LessonsAndBags(_lessons(replace(config, batch_size=config.batch_size - recorded), actors), found)
+
+
+def _lessons(config: ImitationConfig, actors: ActorOptions) -> LessonSource:
+    return LessonSource(config, actors.pool(partial(LessonActor, config, config.network)))
 
 
 def _data(config: ImitationConfig, bags: Sequence[Path]) -> str:

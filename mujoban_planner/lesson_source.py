@@ -1,37 +1,31 @@
 """Batches of lessons for imitation: demonstrations and corrections, kept, drawn, and shown as they are seen.
 
+Actors make the lessons (`mujoban_rl.actors`), as many as are due, so that a run with a process beside is repeatable.
+
 Shapes: B batch.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mujoban_planner.lessons import LessonMaker, LessonProcess
-from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.uncertainty import blur, hide_unseen
-from mujoban_planner.validation import Shares, difficulty_shares
+from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares
+from mujoban_rl.actors import Actor, ActorPool, Experience
 from mujoban_rl.engine import Source, State
-from mujoban_rl.weights import save_weights
 
-_STOCK_BATCHES: Final = 800
-"""Batches of demonstrations kept ahead, and learned from before the planner's own play is worth correcting."""
-_ENOUGH: Final = 20_000
-"""Corrections from which on they make up their whole share of a batch."""
-_HANDED_OVER: Final = 500
-"""Updates after which a process beside plays with newer weights."""
-_BITS: Final = 1000
-"""Streams of levels that one seed may use up, one for each bit of a run with a process beside."""
+_STREAMS: Final = 1000
+"""Streams of levels that one seed may use up, one for each actor."""
+_KINDS: Final = ("demonstrations", "corrections")
 
 
 @dataclass(frozen=True)
@@ -51,122 +45,97 @@ class LessonConfig:
     """Share of a batch that shows only what the robot may have seen so far."""
     mix: Shares = (0.03, 0.04, 0.06, 0.12, 0.75)
     """Shares of difficulties 1 to 5 among the training levels."""
+    levels: int = 256
+    """Fresh levels of a lesson; the planner plays half as many before it is corrected."""
+    stock: int = 800
+    """Batches of demonstrations kept ahead, and learned from before the planner's own play is worth correcting."""
+    enough: int = 20_000
+    """Corrections from which on they make up their whole share of a batch."""
     buffer: int = 2_000_000
     """Samples kept of demonstrations, and as many of corrections."""
     seed: int = 0
 
 
-class _Workshop(ABC):
-    """Where lessons are made."""
+class LessonActor(Actor):
+    """Makes lessons: demonstrations at first, then corrections of the planner's play by turns with them.
 
-    @abstractmethod
-    def demonstrations(self, *, wait: bool) -> Samples | None:
-        """Return new demonstrations; None where there are none yet and nobody waits."""
+    Delivered are the columns of `Samples` of one lesson, under `demonstrations.` or `corrections.`; a step is a sample.
+    """
 
-    @abstractmethod
-    def corrections(self) -> Samples | None:
-        """Return new corrections, or None where there are none yet."""
+    def __init__(self, config: LessonConfig, network: NetworkConfig, stream: int) -> None:
+        """Start without a lesson.
 
-    @abstractmethod
-    def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
+        Args:
+            config: What defines the lessons.
+            network: What to build for the weights whose play is corrected.
+            stream: Of levels and randomness.
+        """
+        self._config, self._planner = config, network.build().eval()
+        self._planner.lay_out()
+        self._maker = LessonMaker(_STREAMS * config.seed + stream, difficulty_shares(config.mix), config.judged)
+        self._version = 0
+        self._ahead = 0  # demonstrations less corrections, since there are any of these
+
+    def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
         """Correct the play of a planner with these weights."""
+        self._planner.load_state_dict(weights)
+        self._version = version
 
-    @property
-    @abstractmethod
-    def cpu_seconds(self) -> float:
-        """CPU time of a process beside."""
+    def act(self) -> Experience:
+        """Make a lesson."""
+        config, correctable = self._config, self._version > self._config.stock
+        correct = correctable and self._ahead >= 0
+        if correct:
+            lesson = self._maker.corrections(self._planner, max(config.levels // 2, 1))
+        else:
+            lesson = self._maker.demonstrations(config.levels)
+        n = len(lesson.agent)
+        self._ahead += correctable * (-n if correct else n)
+        return Experience({f"{_KINDS[correct]}.{name}": column for name, column in lesson._asdict().items()}, n)
 
-    def close(self) -> None:  # noqa: B027 - only a process is ended
-        """End what runs beside."""
+    def state(self) -> State:
+        """Return all that changes but the weights."""
+        return State.of({"own": State({"ahead": self._ahead}), "maker": self._maker.state()})
 
-
-class _Inside(_Workshop):
-    """Makes lessons in this process, between the steps: the same for the same seed."""
-
-    def __init__(self, config: LessonConfig, player: LearnedPlanner) -> None:
-        self.maker = LessonMaker(_BITS * config.seed, difficulty_shares(config.mix), config.judged)
-        self._player = player
-
-    def demonstrations(self, *, wait: bool) -> Samples:
-        return self.maker.demonstrations()
-
-    def corrections(self) -> Samples:
-        return self.maker.corrections(self._player)
-
-    def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
-        self._player.load_state_dict(weights)
-
-    @property
-    def cpu_seconds(self) -> float:
-        return 0.0
-
-
-class _Beside(_Workshop):
-    """Takes lessons from a process beside, whenever they are ready."""
-
-    def __init__(self, config: LessonConfig, player: LearnedPlanner, played: Path, bit: int) -> None:
-        stream = _BITS * config.seed + bit
-        self._process = LessonProcess(stream, difficulty_shares(config.mix), config.judged, played, niceness=1)
-        self._player, self._played, self._version = player, played, -_HANDED_OVER
-
-    def demonstrations(self, *, wait: bool) -> Samples | None:
-        return self._process.take(self._process.demonstrations, wait=wait)
-
-    def corrections(self) -> Samples | None:
-        return self._process.take(self._process.corrections, wait=False)
-
-    def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
-        if version and version - self._version >= _HANDED_OVER:
-            self._version = version
-            self._player.load_state_dict(weights)
-            save_weights(self._played, self._player, self._player.config, {"updates": version})
-
-    @property
-    def cpu_seconds(self) -> float:
-        return self._process.cpu_seconds
-
-    def close(self) -> None:
-        self._process.close()
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._ahead = state.part("own").values["ahead"]
+        self._maker.restore(state.part("maker"))
 
 
 class LessonSource(Source[Batch]):
     """Batches of lessons, half of them corrections, under random symmetries, blurred and with cells hidden.
 
-    Lessons that are made inside are part of a checkpoint, so that a run goes on to the bit. With a process beside,
-    which makes them at its own pace, a run that goes on draws fresh levels into empty buffers.
+    Each batch waits for the lesson that is due for it, so that old ones are not learned by heart where the learner is
+    faster than those who make lessons.
     """
 
-    def __init__(self, config: LessonConfig, player: LearnedPlanner, beside: Path | None = None) -> None:
+    def __init__(self, config: LessonConfig, pool: ActorPool) -> None:
         """Start without lessons.
 
         Args:
             config: What defines them.
-            player: Planner whose play is corrected; gets the published weights, and is not shared with the learner.
-            beside: Weights file through which the planner goes to a process of its own; None makes lessons inside.
+            pool: Its `LessonActor`s make them.
         """
-        self._config, self._player, self._beside = config, player.eval(), beside
+        self._config, self._pool = config, pool
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)
-        self._demonstrations, self._corrections = SampleBuffer(config.buffer), SampleBuffer(config.buffer)
-        self._inside = None if beside is not None else _Inside(config, player)
-        self._workshop: _Workshop | None = self._inside
-        self._bit = 0
-        self._from: int | None = 0 if beside is None else None
-        """Samples learned from before the buffers were filled."""
+        self._buffers = {kind: SampleBuffer(config.buffer) for kind in _KINDS}
 
     def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
-        """Correct the play of a planner with these weights from now on."""
-        self._open().publish(weights, version)
+        """Correct the play of a planner with these weights in lessons that are begun from now on."""
+        self._pool.publish(weights, version)
 
     def next_batch(self) -> Batch:
         """Return B samples, as the planner will see them."""
-        self._collect()
-        config = self._config
+        config, (demonstrations, corrections) = self._config, self._buffers.values()
+        if demonstrations.added + corrections.added < self._due():
+            self._add(self._pool.collect())
         # A few corrections must not be learned by heart.
-        corrections = int(config.batch_size * config.corrections * min(1.0, self._corrections.size / _ENOUGH))
-        parts = [self._demonstrations.draw(config.batch_size - corrections, self._rng)]
-        if corrections:
-            parts.append(self._corrections.draw(corrections, self._rng))
+        corrected = int(config.batch_size * config.corrections * min(1.0, corrections.size / config.enough))
+        parts = [demonstrations.draw(config.batch_size - corrected, self._rng)]
+        if corrected:
+            parts.append(corrections.draw(corrected, self._rng))
         batch = make_batch(concatenate(parts), self._rng.integers(0, SYMMETRIES, config.batch_size))
         order = torch.randperm(config.batch_size, generator=self._generator)
         batch = Batch._make(x[order] for x in batch)
@@ -174,62 +143,39 @@ class LessonSource(Source[Batch]):
         self.samples += config.batch_size
         return batch._replace(state=hide_unseen(state, config.hidden, self._rng))
 
-    def _open(self) -> _Workshop:
-        if self._workshop is None:
-            assert self._beside is not None
-            self._workshop = _Beside(self._config, self._player, self._beside, self._bit)
-        return self._workshop
+    def _due(self) -> float:
+        """Return how many samples the lessons must have had; what is missing comes in lesson by lesson."""
+        config = self._config
+        stock, fresh = config.stock * config.batch_size, config.freshness * self.samples
+        return stock + fresh if self.samples <= stock else stock + config.enough + 2.0 * fresh
 
-    def _collect(self) -> None:
-        """Fetch lessons where the buffers lag behind what was learned from."""
-        config, workshop = self._config, self._open()
-        if self._from is None:
-            self._from = self.samples
-        learned, stock = self.samples - self._from, _STOCK_BATCHES * config.batch_size
-        if self._demonstrations.added < stock + config.freshness * learned:
-            new = workshop.demonstrations(wait=self._demonstrations.size == 0)
-            if new is not None:
-                self._demonstrations.add(new)
-        if self.samples > stock and self._corrections.added < _ENOUGH + config.freshness * learned:
-            new = workshop.corrections()
-            if new is not None:
-                self._corrections.add(new)
+    def _add(self, lesson: Experience) -> None:
+        kind = next(iter(lesson.arrays)).partition(".")[0]
+        self._buffers[kind].add(Samples(**{name: lesson.arrays[f"{kind}.{name}"] for name in Samples._fields}))
 
     def statistics(self) -> dict[str, float]:
-        """Return how many lessons there were."""
-        added = {"demonstrations": self._demonstrations.added, "corrections": self._corrections.added}
-        return {name: float(n) for name, n in added.items()}
+        """Return how many samples of lessons there were."""
+        return {kind: float(buffer.added) for kind, buffer in self._buffers.items()}
 
     def state(self) -> State:
-        """Return random states and, where they are made inside, all lessons and what their maker remembers."""
-        values = {"rng": self._rng.bit_generator.state, "bit": self._bit, "from": self._from}
-        own = State(values, {"generator": self._generator.get_state()})
-        if self._inside is None:
-            return State.of({"own": own})
-        parts = {"demonstrations": self._demonstrations, "corrections": self._corrections, "maker": self._inside.maker}
-        return State.of({"own": own} | {name: part.state() for name, part in parts.items()})
+        """Return random states, all lessons, and where those are who make them."""
+        own = State({"rng": self._rng.bit_generator.state}, {"generator": self._generator.get_state()})
+        kept = {kind: buffer.state() for kind, buffer in self._buffers.items()}
+        return State.of({"own": own, "pool": self._pool.state()} | kept)
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         own = state.part("own")
         self._rng.bit_generator.state = own.values["rng"]
         self._generator.set_state(own.tensors["generator"])
-        self._bit = own.values["bit"] + (self._inside is None)
-        self._from = None
-        if self._inside is not None and "maker" in state.values:
-            self._from = own.values["from"]
-            for name, part in (
-                ("demonstrations", self._demonstrations),
-                ("corrections", self._corrections),
-                ("maker", self._inside.maker),
-            ):
-                part.restore(state.part(name))
+        self._pool.restore(state.part("pool"))
+        for kind, buffer in self._buffers.items():
+            buffer.restore(state.part(kind))
 
     def worker_cpu_seconds(self) -> float:
-        """Return the CPU time of the process beside."""
-        return 0.0 if self._workshop is None else self._workshop.cpu_seconds
+        """Return the CPU time of the processes that make lessons, as far as they have delivered."""
+        return self._pool.cpu_seconds
 
     def close(self) -> None:
-        """End the process beside."""
-        if self._workshop is not None:
-            self._workshop.close()
+        """End those who make lessons."""
+        self._pool.close()

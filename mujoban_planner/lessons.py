@@ -1,19 +1,7 @@
-"""What a planner is taught: demonstrations of fresh levels, and corrections of its own play (DAgger).
-
-A `LessonMaker` makes samples in this process; `LessonProcess` runs one beside the training at low priority and hands
-them over through queues.
-"""
+"""What a planner is taught: demonstrations of fresh levels, and corrections of its own play (DAgger)."""
 
 from __future__ import annotations
 
-import os
-import queue
-import time
-from multiprocessing import get_context
-from multiprocessing.queues import Queue
-from multiprocessing.sharedctypes import Synchronized
-from multiprocessing.synchronize import Event
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -21,15 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_core import children
-from mujoban_planner import load
 from mujoban_planner.boards import join_levels, take_levels
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import Game, play
 from mujoban_planner.samples import Samples, concatenate, make_batch
 from mujoban_planner.teacher import Teacher, label_deadly, possible_pushes
 from mujoban_rl.engine import State
-from mujoban_rl.weights import WeightsError
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 from mujoban_sokoban.levels import LevelBatch
 from mujoban_sokoban.solver import Status
@@ -103,7 +88,7 @@ class LessonMaker:
                 parts[difficulty] = generate_batch(difficulty, seeds)
         return parts
 
-    def demonstrations(self, n: int = 256) -> Samples:
+    def demonstrations(self, n: int) -> Samples:
         """Return samples of the solutions of `n` fresh levels, thinned on walks."""
         fresh = self.levels(n).values()
         parts = [self._teacher.demonstrate(levels, self._rng, judged=self._judged) for levels in fresh]
@@ -111,7 +96,7 @@ class LessonMaker:
         walking = (samples.right != 0) & (samples.right & possible_pushes(samples.boards) == 0)
         return samples.take(~walking | (self._rng.random(len(walking)) < _WALK_SHARE))
 
-    def corrections(self, planner: LearnedPlanner, n: int = 128) -> Samples:
+    def corrections(self, planner: LearnedPlanner, n: int) -> Samples:
         """Let the planner play `n` fresh levels and return what it should have done where it went wrong.
 
         A lost level is searched for the instruction that lost it; the demonstration starts from the state before. It
@@ -218,88 +203,3 @@ def _misjudged(logit: Tensor, dead: Tensor, known: Tensor) -> Tensor:
 def _states(levels: LevelBatch, game: Game, rows: NDArray[np.int64], times: NDArray[np.int64]) -> LevelBatch:
     """Return the states of levels `rows` before their instruction number `times`."""
     return take_levels(levels, rows)._replace(boxes=game.boxes[rows, times], player=game.player[rows, times])
-
-
-class LessonProcess:
-    """A `LessonMaker` in a process of its own, which plays with the newest weights that the trainer has written."""
-
-    def __init__(self, stream: int, mix: dict[int, float], judged: float, weights: Path, niceness: int) -> None:
-        """Start the process; corrections come once `weights` exists."""
-        context = get_context("spawn")
-        self._stop: Event = context.Event()
-        self.demonstrations: Queue[Samples] = context.Queue(maxsize=2)
-        self.corrections: Queue[Samples] = context.Queue(maxsize=2)
-        self._spent = context.Value("d", 0.0)
-        queues = (self.demonstrations, self.corrections)
-        arguments = (stream, mix, judged, weights, niceness, self._stop, self._spent, *queues)
-        self._process = context.Process(target=_make_lessons, args=arguments, daemon=True)
-        with children.sheltered():
-            self._process.start()
-
-    @property
-    def cpu_seconds(self) -> float:
-        """CPU time that the process has used."""
-        return self._spent.value
-
-    def take(self, source: Queue[Samples], wait: bool) -> Samples | None:
-        """Return the next samples of a queue, or None when there are none yet and `wait` is false.
-
-        Raises:
-            RuntimeError: If the process died.
-        """
-        while True:
-            try:
-                return source.get(timeout=1.0) if wait else source.get_nowait()
-            except queue.Empty:
-                if not self._process.is_alive():
-                    raise RuntimeError("the process that makes lessons died; its error stands above") from None
-                if not wait:
-                    return None
-
-    def close(self) -> None:
-        """End the process."""
-        self._stop.set()
-        self._process.join(timeout=2.0)
-        if self._process.is_alive():
-            self._process.terminate()
-            self._process.join()
-
-
-def _make_lessons(
-    stream: int,
-    mix: dict[int, float],
-    judged: float,
-    weights: Path,
-    niceness: int,
-    stop: Event,
-    spent: Synchronized[float],
-    demonstrations: Queue[Samples],
-    corrections: Queue[Samples],
-) -> None:
-    children.end_with_parent()
-    torch.set_num_threads(1)
-    os.nice(niceness)
-    maker = LessonMaker(stream, mix, judged)
-    planner: LearnedPlanner | None = None
-    version = 0.0
-    while not stop.is_set():
-        busy = True
-        spent.value = time.process_time()
-        if not demonstrations.full():
-            demonstrations.put(maker.demonstrations())
-        elif not corrections.full() and weights.exists():
-            if (found := weights.stat().st_mtime) != version:
-                try:
-                    planner, version = load(weights, compiled=False), found
-                except WeightsError:  # caught between the two files of a newer version: try again
-                    continue
-            if planner is not None:
-                corrections.put(maker.corrections(planner))
-        else:
-            busy = False
-        if not busy:
-            stop.wait(0.2)
-    demonstrations.cancel_join_thread()
-    corrections.cancel_join_thread()
-
-

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -50,7 +51,15 @@ class _Command(ABC):
 
 
 @dataclass(frozen=True)
-class Imitation(_Command):
+class _ActorCommand(_Command):
+    """What trainings with actors have in common."""
+
+    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
+    """Where levels are played or searched."""
+
+
+@dataclass(frozen=True)
+class Imitation(_ActorCommand):
     """Imitate the solver."""
 
     run: Path = Path("runs/planner")
@@ -59,26 +68,18 @@ class Imitation(_Command):
     """Device of the network."""
     samples: float = 1e12
     """Stop at so many samples; a later call resumes."""
-    processes: int = 1
-    """Processes that make lessons: 1, or 0 for a deterministic run."""
     bags: tuple[Path, ...] = ()
     """Recorded bags, or folders of bags, whose decisions join the lessons, labelled by the solver."""
+    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=partial(ActorOptions, "processes"))
+    """Where lessons are made: in a process beside, unless told otherwise."""
     config: tyro.conf.OmitArgPrefixes[ImitationConfig] = field(default_factory=ImitationConfig)
 
     def main(self) -> None:
         """Train."""
         trainer = imitation(
-            self.config, self.run, self.cadence(), device=self.device, processes=self.processes, bags=self.bags
+            self.config, self.run, self.cadence(), device=self.device, actors=self.actors, bags=self.bags
         )
         trainer.run(limit_seconds=self.seconds, limit_samples=self.samples)
-
-
-@dataclass(frozen=True)
-class _ActorCommand(_Command):
-    """What trainings with actors have in common."""
-
-    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
-    """Where levels are played or searched."""
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,8 @@ from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
 from mujoban_planner.reinforcement import MPOConfig, MPOLearner, reinforcement, reset_stay_logit
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
+from mujoban_rl.actors import ActorOptions
+from mujoban_rl.engine import Cadence
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import WeightsError, save_weights
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
@@ -38,14 +40,11 @@ SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
 def _quick(monkeypatch):
     torch.set_num_threads(1)
     monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
-    monkeypatch.setattr("mujoban_planner.lesson_source._STOCK_BATCHES", 4)
-    monkeypatch.setattr("mujoban_planner.lessons._PLAY_LIMIT", 8)
-    monkeypatch.setattr(LessonMaker.demonstrations, "__defaults__", (24,))
-    monkeypatch.setattr(LessonMaker.corrections, "__defaults__", (8,))
 
 
-def _imitation(path, **changes):
-    return imitation(ImitationConfig(**SMALL | {"buffer": 50_000} | changes), path, processes=0)
+def _imitation(path, actors=None, **changes):
+    small = {"buffer": 50_000, "levels": 16, "stock": 4}
+    return imitation(ImitationConfig(**SMALL | small | changes), path, Cadence(publish_updates=1), actors=actors)
 
 
 def _imitate(path, samples):
@@ -65,23 +64,24 @@ def test_imitation_learns_resumes_and_writes_a_loadable_planner(tmp_path):
     assert record["samples"] == 128 and "success_rate/1" in record["metrics"]
 
 
-def test_imitation_that_is_terminated_and_resumed_equals_one_that_never_stopped(tmp_path, monkeypatch):
-    # Corrections of its own play come in from the second batch on.
-    monkeypatch.setattr("mujoban_planner.lesson_source._STOCK_BATCHES", 1)
-    monkeypatch.setattr("mujoban_planner.lesson_source._ENOUGH", 200)
-    check_resuming(_imitation, tmp_path, stop_at=4, updates=7)
+@pytest.mark.parametrize(("actors", "schedule"), [("local", "turns"), ("processes", "ordered")])
+def test_imitation_that_is_terminated_and_resumed_equals_one_that_never_stopped(tmp_path, actors, schedule):
+    runs = []
+
+    def make(path):
+        # Lessons from another process are those that this one makes in the same order.
+        where = ActorOptions(actors if path.name == "parts" else "local", schedule=schedule)
+        runs.append(_imitation(path, where, stock=1, enough=2000, levels=8))
+        return runs[-1]
+
+    check_resuming(make, tmp_path, stop_at=5, updates=7)
+    source = runs[-1].source
+    assert all(n > 0 for n in source.statistics().values()), "its own play was not corrected"
+    assert (source.worker_cpu_seconds() > 0.0) == (actors == "processes")
 
 
 def test_imitation_refuses_a_batch_with_nan(tmp_path):
     check_refusal(_imitation(tmp_path), lambda batch: batch._replace(value=batch.value * math.nan))
-
-
-def test_lessons_come_from_a_process_beside(tmp_path):
-    config = ImitationConfig(**SMALL, buffer=50_000, mix=(1.0, 0.0, 0.0, 0.0, 0.0))
-    trainer = imitation(config, tmp_path, processes=1)
-    trainer.run(limit_updates=1)
-    assert trainer.progress.updates == 1
-    assert trainer.source.statistics()["demonstrations"] > 0 and trainer.source.worker_cpu_seconds() > 0
 
 
 def test_a_small_batch_can_be_learned_by_heart():
