@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional
 
 from mujoban_core.grid import Instruction
 from mujoban_core.look_around import Scout, ScriptedScout
@@ -23,13 +22,12 @@ from mujoban_planner.boards import abstract_states
 from mujoban_planner.discrete_mpo import Answer, DiscreteMPOLearner, MPOBatch, StepStore
 from mujoban_planner.exploration_env import SHOWN, ExplorationEnvironment, ExplorationReward
 from mujoban_planner.explorer import Explorer
-from mujoban_planner.moves import LevelStream, PlayConfig
+from mujoban_planner.moves import LevelStream, PlayConfig, Resumable, SequenceActor
 from mujoban_planner.symmetry import SYMMETRIES, view_states
 from mujoban_planner.validation import difficulty_shares, validation_levels
-from mujoban_rl.actors import Actor, ActorOptions, ActorSource, Experience
-from mujoban_rl.engine import Budget, Cadence, State, Trainer
+from mujoban_rl.actors import ActorOptions, ActorSource
+from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.losses.mpo_discrete import DiscreteMPOConfig
-from mujoban_rl.replay import SequenceBuilder
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import provenance, save_weights
 
@@ -66,18 +64,22 @@ class ExplorerConfig(PlayConfig):
     """Updates after which it is complete."""
 
 
-class ExplorerActor(Actor):
-    """Explores by actions that are drawn from the policy."""
+class ExplorerActor(SequenceActor):
+    """Explores levels."""
 
     def __init__(self, config: ExplorerConfig, network: Mapping[str, Any], stream: int) -> None:
         """Begin E levels; `stream` is the number of the random stream."""
-        self._config, self._explorer = config, Explorer(**network).eval()
-        stream_of_levels = LevelStream(difficulty_shares(config.mix), config.seed, stream)
-        self._pool = stream_of_levels.draw(config.levels)
+        self._explorer, self._horizon = Explorer(**network), config.horizon
+        levels = LevelStream(difficulty_shares(config.mix), config.seed, stream)
+        self._pool = levels.draw(config.levels)
         rng = np.random.default_rng([config.seed, _STREAM, stream])
-        self._generator = torch.Generator().manual_seed(int(rng.integers(1 << 31)))
+        generator = torch.Generator().manual_seed(int(rng.integers(1 << 31)))
+        super().__init__(config, self._explorer, generator)
         self._environment = ExplorationEnvironment(self._draw(config.environments), rng, config.reward)
-        self._builder = SequenceBuilder(config.play + config.n_step, config.n_step)
+
+    @property
+    def _parts(self) -> dict[str, Resumable]:
+        return {"environment": self._environment}
 
     def _draw(self, count: int) -> NDArray[np.float32]:
         """Return random levels of the pool under random symmetries, [count, N, N, 4]."""
@@ -86,44 +88,19 @@ class ExplorerActor(Actor):
         return view_states(self._pool[rows], symmetries).numpy()
 
     def _ends(self, count: int) -> NDArray[np.bool_]:
-        return (torch.rand(count, generator=self._generator) < 1.0 / self._config.horizon).numpy()
+        return (torch.rand(count, generator=self._generator) < 1.0 / self._horizon).numpy()
 
-    def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
-        """Explore with these weights."""
-        self._explorer.load_state_dict(weights)
-
-    @torch.no_grad()
-    def act(self) -> Experience:
-        """Explore until there is a sequence."""
-        steps, sequence = 0, None
-        rewards: list[float] = []
-        while sequence is None:
-            state = self._environment.observe()
-            with torch.autocast("cpu", torch.bfloat16):
-                policy = self._explorer(torch.from_numpy(state)).policy
-            chances = functional.softmax(policy.float(), 1)
-            action = torch.multinomial(chances, 1, generator=self._generator)[:, 0].numpy()
-            step = self._environment.step(action)
-            cut = step.truncated | ~step.complete & self._ends(len(action))
-            over = np.flatnonzero(step.complete | cut)
-            self._environment.begin(over, self._draw(len(over)))
-            steps += len(action)
-            rewards += step.reward.tolist()
-            kept = {"state": state.astype(np.float16), "instruction": action, "reward": step.reward}
-            sequence = self._builder.add({**kept, "terminated": step.complete, "dropped": cut})
-        return Experience(sequence, steps, {"reward": np.array(rewards)})
-
-    def state(self) -> State:
-        """Return all that changes but the weights."""
-        own = State(tensors={"generator": self._generator.get_state()})
-        parts = {"environment": self._environment, "builder": self._builder}
-        return State.of({"own": own} | {name: part.state() for name, part in parts.items()})
-
-    def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
-        self._generator.set_state(state.part("own").tensors["generator"])
-        self._environment.restore(state.part("environment"))
-        self._builder.restore(state.part("builder"))
+    def _step(self) -> tuple[dict[str, NDArray[Any]], dict[str, list[float]]]:
+        state = self._environment.observe()
+        with torch.autocast("cpu", torch.bfloat16):
+            policy = self._explorer(torch.from_numpy(state)).policy
+        action = self._choose(policy.float()).numpy()
+        step = self._environment.step(action)
+        cut = step.truncated | ~step.complete & self._ends(len(action))
+        over = np.flatnonzero(step.complete | cut)
+        self._environment.begin(over, self._draw(len(over)))
+        kept = {"state": state.astype(np.float16), "instruction": action, "reward": step.reward}
+        return {**kept, "terminated": step.complete, "dropped": cut}, {"reward": step.reward.tolist()}
 
 
 def judge_scout(

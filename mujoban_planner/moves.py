@@ -5,17 +5,19 @@ Shapes: E levels, L instructions of a sequence, N = `grid.GRID_SIZE`, A = 5 inst
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
+from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_core.grid import CHANNELS, GRID_SIZE
-from mujoban_planner.abstract_env import AbstractEnvironment, AbstractStep
+from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.discrete_mpo import MPOSettings
 from mujoban_planner.planner import LearnedPlanner
@@ -79,8 +81,78 @@ class LevelStream:
         self._rng.bit_generator.state = state.values["rng"]
 
 
-class MoveActor(Actor):
-    """Plays instructions that are drawn from the policy; delivers sequences of L = `play` + `n_step` of them."""
+class Resumable(Protocol):
+    """What goes on from a state."""
+
+    def state(self) -> State:
+        """Return all that changes."""
+        ...
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+
+
+class SequenceActor(Actor):
+    """Plays actions that are drawn from a policy; delivers sequences of L = `play` + `n_step` of them."""
+
+    def __init__(self, config: PlayConfig, network: nn.Module, generator: torch.Generator) -> None:
+        """Start without a sequence.
+
+        Args:
+            config: How to play.
+            network: Gets the learner's weights.
+            generator: Draws actions.
+        """
+        self._config, self._network, self._generator = config, network.eval(), generator
+        self._builder = SequenceBuilder(config.play + config.n_step, config.n_step)
+
+    @property
+    @abstractmethod
+    def _parts(self) -> Mapping[str, Resumable]:
+        """What is played in, by name."""
+
+    @abstractmethod
+    def _step(self) -> tuple[Mapping[str, NDArray[Any] | Tensor], Mapping[str, Sequence[float]]]:
+        """Play one action in every level; return what is kept of it, [E, ...] each, and what to log."""
+
+    def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
+        """Play with these weights."""
+        self._network.load_state_dict(weights)
+
+    @torch.no_grad()
+    def act(self) -> Experience:
+        """Play until there is a sequence; its last `n_step` actions begin the next one too."""
+        steps, sequence = 0, None
+        seen: dict[str, list[float]] = {}
+        while sequence is None:
+            tick, statistics = self._step()
+            for name, values in statistics.items():
+                seen.setdefault(name, []).extend(values)
+            steps += self._config.environments
+            sequence = self._builder.add(tick)
+        return Experience(sequence, steps, {name: np.array(values) for name, values in seen.items()})
+
+    def _choose(self, policy: Tensor) -> Tensor:
+        """Draw actions by logits [E, A], int64 [E]."""
+        chances = functional.softmax(policy, 1).cpu()
+        return torch.multinomial(chances, 1, generator=self._generator)[:, 0]
+
+    def state(self) -> State:
+        """Return all that changes but the weights."""
+        own = State(tensors={"generator": self._generator.get_state()})
+        parts = {"builder": self._builder.state()} | {name: part.state() for name, part in self._parts.items()}
+        return State.of({"own": own} | parts)
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._generator.set_state(state.part("own").tensors["generator"])
+        self._builder.restore(state.part("builder"))
+        for name, part in self._parts.items():
+            part.restore(state.part(name))
+
+
+class MoveActor(SequenceActor):
+    """Plays instructions in the time-abstracted task."""
 
     def __init__(
         self,
@@ -100,58 +172,31 @@ class MoveActor(Actor):
             stream: Number of the random stream.
             device: Where planner and levels are.
         """
-        self._config, self._device = config, torch.device(device)
-        self._planner = architecture(**network).to(self._device).eval()
+        self._device = torch.device(device)
+        self._planner = architecture(**network).to(self._device)
         self._planner.lay_out()
         self._levels = LevelStream(difficulty_shares(config.mix), config.seed, stream)
-        self._generator = torch.Generator().manual_seed(_STREAMS_PER_SEED * config.seed + stream)
+        generator = torch.Generator().manual_seed(_STREAMS_PER_SEED * config.seed + stream)
         failures = torch.Generator(self._device).manual_seed(_STREAMS_PER_SEED * config.seed + stream)
         self._environment = AbstractEnvironment(
             config.environments, device=device, failure_rate=config.failure_rate, generator=failures
         )
         self._environment.reset_to(torch.arange(config.environments), self._levels.draw(config.environments))
-        self._builder = SequenceBuilder(config.play + config.n_step, config.n_step)
+        super().__init__(config, self._planner, generator)
 
-    def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
-        """Play with these weights."""
-        self._planner.load_state_dict(weights)
+    @property
+    def _parts(self) -> dict[str, Resumable]:
+        return {"levels": self._levels, "environment": self._environment}
 
-    def act(self) -> Experience:
-        """Play until there is a sequence; its last `n_step` instructions begin the next one too."""
-        steps, sequence = 0, None
-        solved: list[bool] = []
-        while sequence is None:
-            tick, outcome = self._step()
-            over = outcome.solved | outcome.truncated
-            solved += outcome.solved[over].tolist()
-            steps += self._config.environments
-            sequence = self._builder.add({name: values.cpu() for name, values in tick.items()})
-        return Experience(sequence, steps, {"episodes/solved": np.array(solved)})
-
-    @torch.no_grad()
-    def _step(self) -> tuple[dict[str, Tensor], AbstractStep]:
-        """Play one instruction in every level; return what is kept of it, [E, ...] each, and what happened."""
+    def _step(self) -> tuple[dict[str, Tensor], dict[str, list[float]]]:
         state = self._environment.observe()
         with torch.autocast(self._device.type, torch.bfloat16):
             policy = self._planner(state).policy
-        chances = functional.softmax(policy, 1).cpu()
-        instruction = torch.multinomial(chances, 1, generator=self._generator)[:, 0].to(self._device)
+        instruction = self._choose(policy).to(self._device)
         step = self._environment.step(instruction)
         over = torch.nonzero(step.solved | step.truncated)[:, 0]
         if len(over):
             self._environment.reset_to(over, self._levels.draw(len(over)))
         kept = {"state": state > 0.5, "instruction": instruction, "reward": step.reward}
-        return {**kept, "terminated": step.solved, "dropped": step.truncated}, step
-
-    def state(self) -> State:
-        """Return all that changes but the weights."""
-        own = State(tensors={"generator": self._generator.get_state()})
-        parts = {"levels": self._levels, "environment": self._environment, "builder": self._builder}
-        return State.of({"own": own} | {name: part.state() for name, part in parts.items()})
-
-    def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
-        self._generator.set_state(state.part("own").tensors["generator"])
-        self._levels.restore(state.part("levels"))
-        self._environment.restore(state.part("environment"))
-        self._builder.restore(state.part("builder"))
+        kept |= {"terminated": step.solved, "dropped": step.truncated}
+        return {name: values.cpu() for name, values in kept.items()}, {"episodes/solved": step.solved[over].tolist()}
