@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from benchmarks.command import run_benchmark
+from bringup.progress import EpisodesBar
 from bringup.rollout import ticks
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.stats import wilson_interval
@@ -50,8 +49,7 @@ def run(options: Options | None = None) -> dict[str, Any]:
     durations: dict[GoalKind, list[int]] = {kind: [] for kind in GoalKind}
     begun, kind = np.zeros((2, batch), np.int64)
     start = time.perf_counter()
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("episodes", total=len(episodes))
+    with EpisodesBar(len(episodes)) as bar:
         for tick in ticks(policy, world, episodes):
             rows, termination = tick.rows, tick.decision.termination
             issued += int(tick.decision.issued.sum())
@@ -66,7 +64,7 @@ def run(options: Options | None = None) -> dict[str, Any]:
                 lengths.append(int(tick.step[m]) + 1)
                 if not tick.solved[m]:
                     unsolved.append(episodes[tick.episode[m]].seed)
-                progress.advance(task)
+                bar.reach(len(solved), "ended")
     return {
         "n": len(solved),
         "success_rate": float(np.mean(solved)),

@@ -12,17 +12,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from bringup.results import EpisodeResult
 
 
-class SolvedBar(Progress):
-    """How many episodes have ended, and how many of these were solved: a bar on stderr, or lines without a terminal.
+class EpisodesBar(Progress):
+    """How many episodes have ended: a bar on stderr, or plain lines where that is a pipe or file.
 
     It appears when it is told something first, so that nothing stands before the one line of a start that fails.
     """
 
-    def __init__(self, total: int) -> None:
-        """Count to `total` episodes."""
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        super().__init__(*columns, console=Console(stderr=True))
-        self._task = self.add_task("solved", total=total)
+    def __init__(self, total: int, console: Console | None = None) -> None:
+        """Count to `total` episodes, on stderr unless another console is given."""
+        columns = (TextColumn("{task.description}"), BarColumn(None), MofNCompleteColumn(), TimeElapsedColumn())
+        super().__init__(*columns, console=console or Console(stderr=True), expand=True)
+        self._task = self.add_task("", total=total)
         self._total, self._printed = total, 0
 
     def __enter__(self) -> Self:
@@ -36,18 +36,28 @@ class SolvedBar(Progress):
         if self.live.is_started:
             self.stop()
 
+    def reach(self, ended: int, what: str) -> None:
+        """Show that so many episodes have ended.
+
+        Args:
+            ended: Number of episodes.
+            what: Two or three words of what came of them.
+        """
+        if self.console.is_interactive:
+            self.start()
+            self.update(self._task, completed=ended, description=what)
+        elif ended > self._printed and (ended == self._total or 10 * (ended - self._printed) >= self._total):
+            self._printed = ended
+            self.console.print(f"{ended} of {self._total} episodes {what}", highlight=False, soft_wrap=True)
+
+
+class SolvedBar(EpisodesBar):
+    """How many episodes have ended, and what share of these was solved."""
+
     def show(self, results: Sequence[EpisodeResult]) -> None:
         """Show the outcomes so far."""
-        self.start()
         if results:
             share = sum(result.solved for result in results) / len(results)
-            solved = f"solved {100 * share:4.1f} %"
-            self.update(self._task, completed=len(results), description=solved)
-            self._print(len(results), solved)
-
-    def _print(self, ended: int, solved: str) -> None:
-        """Print a line whenever another tenth has ended, in a log, which shows a bar only when it is full."""
-        if self.console.is_terminal or 10 * (ended - self._printed) < self._total:
-            return
-        self._printed = ended
-        self.console.print(f"{ended} of {self._total} episodes, {solved}")
+            self.reach(len(results), f"ended, {100 * share:.1f} % solved")
+        else:
+            self.reach(0, "ended")

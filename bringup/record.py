@@ -18,14 +18,13 @@ from pathlib import Path
 from typing import Annotated, NamedTuple, NoReturn
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 from tyro.conf import arg
 
 from bringup.cluster import spread
 from bringup.command import Stack, import_from_here, recorded_seed
 from bringup.exploration import Disturbance, disturbed
 from bringup.options import ClusterOptions, Count, ModuleOptions, WorldOptions, one_of, whole
+from bringup.progress import EpisodesBar
 from bringup.rollout import ticks
 from mujoban_core import children
 from mujoban_core.bodies import BALL
@@ -283,9 +282,16 @@ def main(command_line: Sequence[str] | None = None) -> int:
     seed = recorded_seed(options.seed, records=True, allow_test_seeds=options.allow_test_seeds)
     jobs = [_job(options, seed, part) for part in range(options.parts)]
     options.out.mkdir(parents=True, exist_ok=True)
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("recorded", total=options.episodes)
-        total = _record_all(jobs, options.shared.cluster, lambda ended: progress.update(task, advance=ended))
+    recorded = 0
+    with EpisodesBar(options.episodes) as bar:
+
+        def on_end(ended: int) -> None:
+            nonlocal recorded
+            recorded += ended
+            bar.reach(recorded, "recorded")
+
+        on_end(0)
+        total = _record_all(jobs, options.shared.cluster, on_end)
     print(f"{total} ticks of {options.episodes} episodes in {len(list(options.out.iterdir()))} bags")
     return 0
 

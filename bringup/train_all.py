@@ -183,28 +183,35 @@ def _evaluation(options: Options) -> Stage:
     )
 
 
-class _Display:
-    """A line a stage: what it has taken of what it may take."""
+class Display:
+    """A line a stage: what it has taken of what it may take; a pipe or file is told when each begins and ends."""
 
     def __init__(self, pipeline: Pipeline, console: Console) -> None:
-        columns = (TextColumn("{task.description:18}"), BarColumn(), TextColumn("{task.fields[note]}"))
-        self.progress = Progress(*columns, console=console, refresh_per_second=1)
+        """Show that all stages wait."""
+        columns = (TextColumn("{task.description}"), BarColumn(None), TextColumn("{task.fields[note]}"))
+        self.progress = Progress(
+            *columns, console=console, refresh_per_second=1, expand=True, disable=not console.is_interactive
+        )
         self._tasks: dict[str, TaskID] = {
             s.name: self.progress.add_task(s.name, total=s.seconds, note="waits") for s in pipeline.stages
         }
+        self._states = dict.fromkeys(self._tasks, "waits")
 
     def update(self, pipeline: Pipeline) -> None:
         """Show how far every stage is."""
         for stage in pipeline.stages:
             spent, done = pipeline.elapsed(stage.name), pipeline.entries[stage.name].done
             if done:
-                note = f"done in {_minutes(spent)}"
+                state, note = "done", f"done in {_minutes(spent)}"
             elif stage.name in pipeline.running():
-                note = f"{_minutes(spent)} of about {_minutes(stage.seconds)}"
+                state, note = "runs", f"{_minutes(spent)} of about {_minutes(stage.seconds)}"
             else:
-                note = "waits"
+                state = note = "waits"
             shown = stage.seconds if done else min(spent, stage.seconds)
             self.progress.update(self._tasks[stage.name], completed=shown, note=note)
+            if self.progress.disable and state != self._states[stage.name]:
+                self.progress.console.print(f"{stage.name}: {note}", highlight=False, soft_wrap=True)
+            self._states[stage.name] = state
 
 
 def _minutes(seconds: float) -> str:
@@ -219,7 +226,7 @@ def train_all(options: Options) -> Path:
         Interrupted: If a signal came.
     """
     pipeline = Pipeline(options.run, stages(options), cores=options.cores)
-    display = _Display(pipeline, Console(stderr=True))
+    display = Display(pipeline, Console(stderr=True))
     with display.progress:
         pipeline.run(display.update)
         display.update(pipeline)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Final
 
 import numpy as np
 from mujoban_msgs.msg import EpisodeTruth
 from numpy.typing import NDArray
+from rich import box
 from rich.columns import Columns
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -27,6 +29,8 @@ ARROWS = {
     Instruction.SOUTH: "↓",
     Instruction.WEST: "←",
 }
+WIDE: Final = 80
+"""Columns in which instruction and maps stand side by side."""
 
 
 def grid_text(state: NDArray[np.float32]) -> Text:
@@ -62,6 +66,8 @@ def live_view(
     tick: Watched | None,
     outcomes: Sequence[EpisodeResult],
     weights: Mapping[str, str] | None = None,
+    *,
+    width: int = WIDE,
 ) -> RenderableType:
     """Return what the terminal shows of the latest tick; modules that are told the ground truth are named.
 
@@ -70,31 +76,37 @@ def live_view(
         tick: What the modules said.
         outcomes: Of the episodes before.
         weights: Name of each module -> what identifies it, see `bringup.command.Stack.identities`.
+        width: Columns of the terminal; with fewer than `WIDE` the maps stand below the instruction.
     """
     if episode is None or tick is None:
         return Text("waiting for the graph ...")
     said = tick.instruction
-    facts = Table.grid(padding=(0, 2))
-    for name, value in (
-        ("episode", f"{episode.episode} (seed {episode.seed})"),
-        ("difficulty", str(episode.difficulty) if episode.difficulty else "level file"),
-        ("time", f"{episode.step * CONTROL_PERIOD:.1f} s, step {episode.step}"),
-        ("return", f"{episode.episode_return:+.0f}"),
-        ("on target", str(episode.boxes_on_target)),
-        ("solved", f"{sum(r.solved for r in outcomes)} of {len(outcomes)}"),
-        ("termination", f"p = {tick.termination.probability:.2f}"),
-        ("privileged", ", ".join(role for role, name in (weights or {}).items() if is_privileged(name)) or "none"),
-    ):
-        facts.add_row(Text(name, "bright_black"), value)
+    facts = {
+        "episode": str(episode.episode),
+        "seed": str(episode.seed),
+        "difficulty": str(episode.difficulty) if episode.difficulty else "level file",
+        "time": f"{episode.step * CONTROL_PERIOD:.1f} s",
+        "step": str(episode.step),
+        "return": f"{episode.episode_return:+.0f}",
+        "on target": str(episode.boxes_on_target),
+        "solved": f"{sum(r.solved for r in outcomes)} of {len(outcomes)}",
+        "termination": f"p = {tick.termination.probability:.2f}",
+    }
     arrow = Text(f"{ARROWS[Instruction(said.direction)]}  {Instruction(said.direction).name.lower()}", "bold green")
     arrow.append(f"   number {said.sequence}", "bright_black")
-    return Columns(
-        [
-            Panel(Group(arrow, Text(), facts), title="instruction", height=12, width=34),
-            Panel(grid_text(tick.estimate), title="estimate", height=12, width=24),
-            Panel(grid_text(tick.truth), title="ground truth", height=12, width=24),
-        ]
-    )
+    maps = [
+        Panel(grid_text(state), title=title, height=12, width=24)
+        for title, state in (("estimate", tick.estimate), ("ground truth", tick.truth))
+    ]
+    told = [role for role, name in (weights or {}).items() if is_privileged(name)]
+    last = Text(f"privileged, told the ground truth: {', '.join(told)}" if told else "", "yellow")
+    if width < WIDE:
+        pairs = [Text.assemble((f"{name} ", "bright_black"), value) for name, value in facts.items()]
+        return Group(arrow, Columns(pairs), Columns(maps), last)
+    table = Table.grid(padding=(0, 1))
+    for name, value in facts.items():
+        table.add_row(Text(name, "bright_black"), value)
+    return Group(Columns([Panel(Group(arrow, table), title="instruction", height=12, width=30), *maps]), last)
 
 
 @contextmanager
@@ -104,15 +116,16 @@ def on_terminal(
     """Return what shows the latest tick of a monitor on a terminal, in place of the one before."""
     with Live(console=console, auto_refresh=False) as live:
         yield lambda monitor, results: live.update(
-            live_view(monitor.episode, monitor.latest, results, weights), refresh=True
+            live_view(monitor.episode, monitor.latest, results, weights, width=console.width), refresh=True
         )
 
 
 def summary(results: Sequence[EpisodeResult]) -> Table:
-    """Return the table of outcomes."""
-    table = Table(title="Episodes")
-    for name in ("seed", "outcome", "return", "steps", "instructions", "time-outs", "wrong estimates"):
-        table.add_column(name, justify="left" if name == "outcome" else "right")
+    """Return the table of outcomes; at 60 columns only the outcome breaks, and no number."""
+    table = Table(title="Episodes", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+    for name in ("seed", "outcome", "return", "steps", "instruc-\ntions", "time-\nouts", "wrong\nesti-\nmates"):
+        words = name == "outcome"
+        table.add_column(name, justify="left" if words else "right", no_wrap=not words, vertical="bottom")
     for r in results:
         outcome = Text("solved", "green") if r.solved else Text(str(r.failure), "red")
         table.add_row(

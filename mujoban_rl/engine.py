@@ -26,6 +26,7 @@ from torch.optim import Optimizer
 
 from mujoban_core import children
 from mujoban_core.signals import StopSignal
+from mujoban_core.text import readable
 from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.progress import Budget, Clock, Meter, Progress
 from mujoban_rl.run_directory import RunDirectory
@@ -268,9 +269,10 @@ class Trainer(Generic[BatchT]):
         self.metrics = {k: float(v) for k, v in self.learner.evaluate().items() if math.isfinite(v)}
         if not self.metrics:
             return
-        log.scalars(self.progress.samples, {f"evaluation/{k}": v for k, v in self.metrics.items()} | self._spent())
-        shown = ", ".join(f"{k} {v:.4g}" for k, v in self.metrics.items())
-        log.message(f"{self.progress.samples} samples, {self.progress.cpu_seconds:.0f} CPU s: {shown}")
+        shown = ", ".join(f"{k} {readable(v)}" for k, v in self.metrics.items())
+        line = f"{self.progress.samples:,} samples, {self.progress.cpu_seconds:,.0f} CPU s: {shown}"
+        scores = {f"evaluation/{k}": v for k, v in self.metrics.items()}
+        log.scalars(self.progress.samples, scores | self._spent(), line)
 
     def _spent(self) -> dict[str, float]:
         progress = self.progress

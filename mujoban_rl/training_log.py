@@ -1,59 +1,131 @@
-"""Progress bar, TensorBoard and `metrics.jsonl` of a training run."""
+"""Progress, TensorBoard and `metrics.jsonl` of a training run."""
 
 from __future__ import annotations
 
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import timedelta
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 from torch import Tensor
 from torch.utils.tensorboard.writer import SummaryWriter
 
+from mujoban_core.text import readable
 from mujoban_rl.run_directory import RunDirectory
+
+_SHOWN: Final = 5
+"""Numbers that are shown, of those that are logged: the first."""
+LINE_SECONDS: Final = 60.0
+"""Between two lines of progress in a pipe or file, at least."""
+
+
+class _Bar(Progress):
+    """A progress bar, and below it the newest numbers: as many as the terminal's width holds, each of them whole."""
+
+    def __init__(self, console: Console, count: str) -> None:
+        """Make a bar without a task, which begins with `count`, a format of its task."""
+        columns = (TextColumn(count), BarColumn(None), TimeElapsedColumn(), TimeRemainingColumn())
+        # The base class asks for what is shown as it is made.
+        self.numbers: Sequence[str] = ()
+        self._terminal = console
+        super().__init__(*columns, console=console, refresh_per_second=2, expand=True)
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Return the bar, then the numbers."""
+        yield self.make_tasks_table(self.tasks)
+        shown = next(
+            (line for n in range(_SHOWN, 0, -1) if len(line := ", ".join(self.numbers[:n])) <= self._terminal.width), ""
+        )
+        yield Text(shown)
 
 
 class TrainingLog:
-    """Progress bar, TensorBoard events and `metrics.jsonl` (the source of learning curves) of a run."""
+    """TensorBoard events and `metrics.jsonl` (the source of learning curves) of a run, and its progress on stderr.
 
-    def __init__(self, run: RunDirectory, *, total: int | None = None, initial: int = 0, unit: str = "step") -> None:
-        """Append to the run's files; `total` and `initial` are in `unit`s of the progress bar."""
+    A terminal shows a bar; a pipe or file gets a plain line at most every `LINE_SECONDS`.
+    """
+
+    def __init__(
+        self,
+        run: RunDirectory,
+        *,
+        total: int | None = None,
+        initial: int = 0,
+        unit: str = "step",
+        console: Console | None = None,
+        line_seconds: float = LINE_SECONDS,
+    ) -> None:
+        """Append to the run's files.
+
+        Args:
+            run: The run's directory.
+            total: Where progress ends, in `unit`s, if it does.
+            initial: Where it begins.
+            unit: What is counted.
+            console: Where progress is shown; by default stderr.
+            line_seconds: Between two lines of progress, where there is no terminal.
+        """
         self._writer = SummaryWriter(str(run.path / "tensorboard"))
         self._file = (run.path / "metrics.jsonl").open("a", encoding="utf-8")
-        columns = (
-            TextColumn("{task.completed:.0f} {task.fields[unit]}s"), BarColumn(), TimeElapsedColumn(),
-            TimeRemainingColumn(), TextColumn("{task.description}", markup=False),
-        )  # fmt: skip
-        self._progress = Progress(*columns, console=Console(stderr=True), refresh_per_second=2)
-        self._bar = self._progress.add_task("", total=total, completed=initial, unit=unit)
-        self._progress.start()
+        self._console = console or Console(stderr=True)
+        end = "" if total is None else f" of {total:,}"
+        self._count = f"{{task.completed:,.0f}}{end} {unit}s"
+        self._bar = _Bar(self._console, self._count)
+        self._task = self._bar.add_task("", total=total, completed=initial)
+        self._line_seconds, self._printed, self._unsaid = line_seconds, -math.inf, False
+        if self._console.is_interactive:
+            self._bar.start()
 
     def advance(self, n: int = 1) -> None:
-        """Move the progress bar."""
-        self._progress.advance(self._bar, n)
+        """Move the progress on."""
+        self._bar.advance(self._task, n)
 
-    def scalars(self, step: int, values: Mapping[str, float | Tensor]) -> None:
-        """Write scalars to TensorBoard and `metrics.jsonl`, and show the first few in the progress bar."""
+    def scalars(self, step: int, values: Mapping[str, float | Tensor], line: str = "") -> None:
+        """Write scalars to TensorBoard and `metrics.jsonl`, and show the first few with the progress.
+
+        Args:
+            step: What learning curves are drawn against.
+            values: Numbers by name.
+            line: What is printed of them in any case, if something.
+        """
         numbers = {k: float(v) for k, v in values.items()}
         for name, value in numbers.items():
             self._writer.add_scalar(name, value, step)
         finite = {k: v if math.isfinite(v) else None for k, v in numbers.items()}
         self._file.write(json.dumps({"step": step, "time": round(time.time(), 1), **finite}) + "\n")
         self._file.flush()
-        shown = [f"{name.rsplit('/')[-1]} {value:.3g}" for name, value in list(numbers.items())[:5]]
-        self._progress.update(self._bar, description=", ".join(shown))
+        shown = list(numbers.items())[:_SHOWN]
+        self._bar.numbers = [f"{name.rsplit('/')[-1]} {readable(value)}" for name, value in shown]
+        self._unsaid = True
+        if line:
+            self._print(line)
+        elif time.monotonic() - self._printed >= self._line_seconds:
+            self._print_progress()
 
-    def message(self, text: str) -> None:
+    def _print_progress(self) -> None:
+        """Print a line of progress, unless a terminal shows the bar."""
+        if not self._console.is_interactive:
+            task = self._bar.tasks[0]
+            elapsed = timedelta(seconds=int(task.elapsed or 0))
+            self._print(f"{self._count.format(task=task)}, {elapsed}: {', '.join(self._bar.numbers)}")
+
+    def _print(self, text: str) -> None:
         """Print a line without breaking the progress bar."""
-        self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._printed, self._unsaid = time.monotonic(), False
 
     def close(self) -> None:
-        """Flush and close everything."""
-        self._progress.stop()
+        """Show how far the run came; flush and close everything."""
+        if self._unsaid:
+            self._print_progress()
+        if self._console.is_interactive:
+            self._bar.stop()
         self._writer.close()
         self._file.close()
 

@@ -7,7 +7,6 @@ import pytest
 
 from bringup.evaluate import evaluate
 from bringup.failure import is_unsolvable, playable_region
-from bringup.progress import SolvedBar
 from bringup.results import EpisodeResult, Failure, report
 from bringup.rollout import ticks
 from mujoban_core.grid import AGENT, BOX, TARGET, WALL, Instruction
@@ -143,15 +142,6 @@ def test_a_report_gives_rate_interval_return_and_every_episode():
     assert content["weights"] == {"planner": "oracle"}
     with pytest.raises(ValueError, match="at least one"):
         report([], {})
-
-
-def test_a_log_tells_how_far_an_evaluation_is(capsys):
-    episode = EpisodeResult(3, True, 11.0, 50, 4, 0, 0, None)
-    with SolvedBar(20) as bar:
-        for ended in range(21):
-            bar.show([episode] * ended)
-        during = capsys.readouterr().err.splitlines()
-    assert len(during) == 10 and during[0] == "2 of 20 episodes, solved 100.0 %"
 
 
 @pytest.mark.parametrize("bad", [{"difficulty": 6}, {"seed": -1}, {"count": 0}])

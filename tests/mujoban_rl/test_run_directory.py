@@ -10,7 +10,6 @@ from mujoban_core.stats import wilson_interval
 from mujoban_rl import run_directory
 from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.run_directory import RunDirectory, RunError
-from mujoban_rl.training_log import TrainingLog
 from mujoban_rl.weights import WeightsError, load_weights, record_path, save_weights
 
 
@@ -170,14 +169,6 @@ def test_nan_guard_refuses_and_gives_up():
 
 def test_a_time_limit_ends_when_its_time_is_up():
     assert TimeLimit(0.0).reached and not TimeLimit(None).reached
-
-
-def test_log_keeps_a_readable_learning_curve(tmp_path):
-    run = RunDirectory(tmp_path, {})
-    with TrainingLog(run, total=2) as log:
-        log.scalars(1, {"loss": torch.tensor(0.5), "bad": float("nan")})
-    line = json.loads((tmp_path / "metrics.jsonl").read_text())
-    assert (line["step"], line["loss"], line["bad"]) == (1, 0.5, None)
 
 
 @pytest.mark.parametrize(("successes", "n"), [(0, 0), (0, 20), (20, 20), (950, 1000)])
