@@ -25,12 +25,12 @@ class Options:
     """What is drawn."""
 
     path: Annotated[Path, tyro.conf.Positional] = Path("docs/images/episode.gif")
-    frames: int = 72
-    size: int = 160
+    frames: int = 60
+    size: int = 320
     """Pixels along the edges of each of the two pictures."""
     milliseconds: int = 110
     """Between two frames."""
-    colours: int = 64
+    colours: int = 32
 
 
 def draw(options: Options) -> None:
