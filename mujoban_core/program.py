@@ -58,9 +58,11 @@ def exit_status(prog: str, command: Callable[[], int]) -> int:
     try:
         with interruptible():
             return _flushed(command)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         if (earlier := interruption(error)) is not None:
             return interrupt_status(earlier)
+        if isinstance(error, ImportError):
+            raise  # of the installation, not of the input
         if isinstance(error, BrokenPipeError):
             # Python flushes once more when it ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -45,13 +45,21 @@ def interrupt_status(error: KeyboardInterrupt) -> int:
 
 
 def interruption(error: BaseException) -> KeyboardInterrupt | None:
-    """Return the interruption after which writing to the terminal failed, since it was closed, if `error` is that."""
+    """Return the interruption that an error hides, if there is one.
+
+    Writing to the terminal fails after one where the terminal was closed, and an extension module that is interrupted
+    while it is imported says in its place that it cannot be initialised.
+    """
     earlier = error.__context__
-    while isinstance(error, OSError) and error.errno == errno.EIO and earlier is not None:
+    while earlier is not None and (isinstance(error, ImportError) or _is_of_closed_terminal(error)):
         if isinstance(earlier, KeyboardInterrupt):
             return earlier
         earlier = earlier.__context__
     return None
+
+
+def _is_of_closed_terminal(error: BaseException) -> bool:
+    return isinstance(error, OSError) and error.errno == errno.EIO
 
 
 def leave(status: int) -> NoReturn:

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from mujoban_core.signals import STOP_SIGNALS, Interrupted, StopSignal, interruptible
+from mujoban_core.signals import STOP_SIGNALS, Interrupted, StopSignal, interruptible, interruption
 
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
@@ -102,3 +102,18 @@ def test_a_child_ends_when_its_parent_is_killed(program):
     # The pipe ends when the last process that could write to it has ended.
     assert select.select([reading], [], [], 20)[0] and os.read(reading, 1) == b""
     os.close(reading)
+
+
+def test_an_interrupted_import_is_an_interruption_and_another_failed_one_is_not():
+    def hidden(cause):
+        try:
+            try:
+                raise cause
+            except BaseException as error:
+                raise ImportError("initialization failed") from error
+        except ImportError as failed:
+            return interruption(failed)
+
+    interrupted = Interrupted(signal.SIGTERM)
+    assert hidden(interrupted) is interrupted
+    assert hidden(RuntimeError("no such driver")) is None
