@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Unpack
 
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from mujoban_core.signals import leave
@@ -15,13 +14,15 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.listening import Received, listen
-from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
 
 HELD_TICKS = 40
 """Unfinished ticks kept in real time, where answers may be late: 2 s."""
 QUEUE_DEPTH = 1024
+MOST_EPISODES = 2**31 - 1
+"""In one file."""
 
 
 class RecorderNode(Node):
@@ -48,10 +49,13 @@ class RecorderNode(Node):
             BagError: If the folder exists already.
         """
         super().__init__("recorder", **options)
-        fixed = ParameterDescriptor(read_only=True)
-        path = declare(self, "path", "bag", fixed)
-        episodes_per_file = declare(self, "episodes_per_file", 32, fixed)
-        about = {name: declare(self, name, "", fixed) for name in ("body", "world")}
+        path = declare(self, "path", "bag", described("folder of the bag, which must not exist yet", fixed=True))
+        count = described("episodes after which the next file of the bag begins", fixed=True, low=1, high=MOST_EPISODES)
+        episodes_per_file = declare(self, "episodes_per_file", 32, count)
+        about = {
+            "body": declare(self, "body", "", described("the robot's body, for the bag to name", fixed=True)),
+            "world": declare(self, "world", "", described("the physical world, for the bag to name", fixed=True)),
+        }
         self.counts: Counter[str] = Counter()
         self._bag = BagWriter(
             Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file, flush_after=FLUSH_AFTER,

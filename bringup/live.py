@@ -19,7 +19,6 @@ import numpy as np
 import rerun as rr
 from diagnostic_msgs.msg import DiagnosticArray
 from mujoban_msgs.msg import AbstractState, EpisodeTruth, Instruction, Termination
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
@@ -37,7 +36,7 @@ from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import reject
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime import diagnostics
-from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK, Topic
@@ -88,9 +87,10 @@ class LiveNode(Node):
         """Open the stream and start listening."""
         super().__init__("live", **options)
         self.counts: Counter[str] = Counter()
-        fixed = ParameterDescriptor(read_only=True)
-        save, address = declare(self, "save", "", fixed), declare(self, "address", LOOPBACK, fixed)
-        grpc_port, web_port = declare(self, "grpc_port", 9876, fixed), declare(self, "web_port", 9090, fixed)
+        save = declare(self, "save", "", described("recording (.rrd) to write; empty: a page is served", fixed=True))
+        address = declare(self, "address", LOOPBACK, described("IP address of the page; 0.0.0.0: all", fixed=True))
+        port = described("port, or the next free one", fixed=True, low=1, high=2**16 - 1)
+        grpc_port, web_port = declare(self, "grpc_port", 9876, port), declare(self, "web_port", 9090, port)
         self._stream = rr.RecordingStream(APPLICATION)
         self._period = 0.0 if save else _PERIOD
         self._server: LiveServer | None = None

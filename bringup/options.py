@@ -17,7 +17,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from bringup.command import Choice, Player, Solo, Stack, oracle
 from mujoban_core.bodies import BALL, BODIES
-from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.grid import DIFFICULTIES, FASTEST
 from mujoban_core.plugins import AGENT, LEARNED, ROLES, SCOUT, SCRIPTED
 from mujoban_core.program import say
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
@@ -67,8 +67,8 @@ def _speed(given: list[str]) -> float:
         speed = float(*given) if given else 1.0
     except (ValueError, TypeError):
         speed = 0.0
-    if not 0.0 < speed < float("inf"):
-        raise ValueError(f"{' '.join(given)}, expected a number above 0")
+    if not 0.0 < speed <= FASTEST:
+        raise ValueError(f"{' '.join(given)}, expected a number above 0, at most {FASTEST:g}")
     return speed
 
 

@@ -25,6 +25,8 @@ CELL_SIZE: Final = 1.0
 
 CONTROL_PERIOD: Final = 0.05
 """Seconds between two torques: 20 Hz (paper appendix B)."""
+FASTEST: Final = 1000.0
+"""Most simulated seconds per second that a run may be paced at."""
 TIME_LIMIT: Final = 4800
 """Steps of an episode: 240 s (paper C.5)."""
 INSTRUCTION_LIMIT: Final = 120

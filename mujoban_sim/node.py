@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Final, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,19 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
+from mujoban_core.bodies import BALL, BODIES
+from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES, FASTEST
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
-from mujoban_msgs_py.runtime.descriptors import NodeOptions
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.kept import KeptArrays
 from mujoban_msgs_py.runtime.pace import Pace
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.observation import ObservationPublisher
-from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 from mujoban_sim.resume import Moment, Place
 from mujoban_sim.tick_messages import TickLabel
 from mujoban_sim.world import World
@@ -36,22 +37,33 @@ from mujoban_sokoban.episodes import Episodes
 MATCH_PERIOD = 0.02
 """Seconds between two looks at whether the graph is complete."""
 
-PARAMETERS: dict[str, Any] = {
-    "seed": 0,
-    "episodes": 0,
-    "difficulty": max(DIFFICULTIES),
-    "level_file": "",
-    "time_limit": 0,
-    "body": "ball",
-    "world": DEFAULT_WORLD,
-    "realtime": 0.0,
-    "resend_after": 0.5,
-    "await_recorder": False,
-    "instructed": True,
-    "top_camera_size": 256,
-    "resume_file": "",
+LARGEST_PICTURE: Final = 4096
+"""Most pixels along its edge."""
+_MOST: Final = 2**63 - 1
+"""Greatest number that a parameter holds."""
+_WORLDS: Final = " or ".join(WORLDS)
+
+
+def _setting(text: str, low: float | None = None, high: float | None = None) -> ParameterDescriptor:
+    return described(text, fixed=True, low=low, high=high)
+
+
+PARAMETERS: Final[dict[str, tuple[Any, ParameterDescriptor]]] = {
+    "seed": (0, _setting("seed of the first episode; the next ones count on", 0, _MOST)),
+    "episodes": (0, _setting("episodes to play; 0: all levels of a level file, else one", 0, _MOST)),
+    "difficulty": (max(DIFFICULTIES), _setting("of generated levels", min(DIFFICULTIES), max(DIFFICULTIES))),
+    "level_file": ("", _setting("levels in the Boxoban format; empty: they are generated")),
+    "time_limit": (0, _setting("steps of an episode; 0: the body's own", 0, _MOST)),
+    "body": (BALL.name, _setting(f"the robot's body: {' or '.join(BODIES)}")),
+    "world": (DEFAULT_WORLD, _setting(f"the physical world: {_WORLDS}")),
+    "realtime": (0.0, _setting("simulated seconds per second; 0: lockstep", 0.0, FASTEST)),
+    "resend_after": (0.5, _setting("seconds without an answer until a tick is offered again", 0.01, 3600.0)),
+    "await_recorder": (False, _setting("whether in lockstep a recorder must have written a tick before the next")),
+    "instructed": (True, _setting("whether torques follow instructions, which a tick then awaits as well")),
+    "top_camera_size": (256, _setting("pixels along the edge of /camera_top/image_raw", 1, LARGEST_PICTURE)),
+    "resume_file": ("", _setting("file of every tick that is offered, to go on from after a crash; empty: none")),
 }
-"""Parameters of the simulator and their defaults."""
+"""Parameters of the simulator: their defaults, and what `ros2 param describe` says of them."""
 
 
 class SimulatorNode(Node):
@@ -87,7 +99,8 @@ class SimulatorNode(Node):
         """Read the parameters and make the world; the first tick follows once the graph is complete.
 
         Raises:
-            ValueError: If a parameter is out of its range or the level file is malformed.
+            ParameterException: If a parameter is out of its range.
+            ValueError: If a body or world is unknown or the level file is malformed.
             OSError: If the level file cannot be read.
             RenderingError: If there is no OpenGL.
         """
@@ -95,10 +108,7 @@ class SimulatorNode(Node):
         self.counts: Counter[str] = Counter()
         self.finished = Future()
         self.ticks = 0
-        fixed = ParameterDescriptor(read_only=True)
-        self._settings: dict[str, Any] = {
-            name: self.declare_parameter(name, value, fixed).value for name, value in PARAMETERS.items()
-        }
+        self._settings: dict[str, Any] = {name: declare(self, name, *about) for name, about in PARAMETERS.items()}
         self.episodes = self._read_episodes()
         self.world = World(
             1,

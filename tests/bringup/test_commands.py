@@ -137,7 +137,8 @@ def test_a_report_goes_through_a_device_and_never_replaces_it(tmp_path, capfd):
         (["--episodes", "0"], "--episodes 0, expected a whole number from 1 on"),
         (["--heedless"], "unrecognized options: --heedless, expected --headless"),
         (["--json"], "--json has no value, expected one"),
-        (["--realtime", "1", "2"], "--realtime 1 2, expected a number above 0"),
+        (["--realtime", "1", "2"], "--realtime 1 2, expected a number above 0, at most 1000"),
+        (["--realtime", "1e9"], "--realtime 1e9, expected a number above 0, at most 1000"),
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])

@@ -11,6 +11,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import SetParameters
+from rclpy.exceptions import InvalidParameterValueException
 from rclpy.parameter import Parameter
 from safetensors.numpy import save
 from sensor_msgs.msg import Image, JointState
@@ -18,10 +19,12 @@ from std_srvs.srv import SetBool, Trigger
 
 from bringup.command import Choice, Stack
 from bringup.graph import NODES, InProcess, Processes
+from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.topics import TICK
+from mujoban_sim.node import PARAMETERS, SimulatorNode
 from mujoban_sokoban.episodes import Episodes
 
 MODULES = ("estimator", "termination", "planner", "controller")
@@ -271,6 +274,26 @@ def test_a_setting_out_of_its_range_is_refused_with_the_reason(
     result = graph.call(SetParameters, f"/{node}/set_parameters", request).results[0]
     assert not result.successful and re.search(reason, result.reason), result.reason
     assert graph.graph.nodes[node].get_parameter(name).value == before
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("difficulty", 6), ("realtime", -1.0), ("resend_after", 0.0), ("episodes", -1)]
+)
+@pytest.mark.usefixtures("ros")
+def test_a_simulator_is_not_made_with_a_parameter_out_of_its_range(name, value):
+    with pytest.raises(InvalidParameterValueException, match=rf"(?s)\b{name}\b.*range"):
+        SimulatorNode(parameter_overrides=[Parameter(name, value=value)])
+
+
+def test_every_parameter_of_the_simulator_and_the_recorder_says_what_it_means(play_graph, tmp_path):
+    simulator = play_graph().simulator
+    path = Parameter("path", value=str(tmp_path / "bag"))
+    recorder = RecorderNode(context=simulator.context, parameter_overrides=[path])
+    try:
+        for node, own in ((simulator, PARAMETERS), (recorder, ("path", "episodes_per_file", "body", "world"))):
+            assert all(about.description for about in node.describe_parameters(list(own)))
+    finally:
+        recorder.destroy_node()
 
 
 def test_missing_weights_stop_a_node_with_a_clear_error(play_graph, oracles, tmp_path):
