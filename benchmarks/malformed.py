@@ -23,6 +23,8 @@ _NUMBERS: Final = (0.0, -0.0, 1.5, -1.0, 1e30, -1e30, float("nan"), float("inf")
 _INTEGERS: Final = (0, 1, 2, 5, 127, 255, 65535, 2**31 - 1, 2**32 - 1, 2**63 - 1, -1, -(2**31))
 _STEPS: Final = 100
 """Ticks that may be missed between two that are heard."""
+DEPTH: Final = 16
+"""Messages of a topic that wait to be heard, those of its own among them."""
 _STAMPS: Final = (0, TICK // 2, TICK, -TICK, 10**15, 2**31 * 10**9 - 1)
 """Nanoseconds to move a stamp by."""
 
@@ -118,7 +120,7 @@ class Vandal(Node):
         self.sent = dict.fromkeys(self._last, 0)
         self.heard = self._tick = 0
         for topic in TARGETS:
-            listen(self, topic, partial(self._hear, topic), qos=live_qos(16))
+            listen(self, topic, partial(self._hear, topic), qos=live_qos(DEPTH))
 
     def act(self, count: int = 1) -> None:
         """Publish so many spoiled messages on every topic."""
@@ -133,6 +135,7 @@ class Vandal(Node):
     def _hear(self, topic: Topic, message: Received) -> None:
         self._last[topic.name] = message.raw
         # It hears itself as well: the run goes on where /episode has a later tick, and one that can follow.
-        if topic is EPISODE and (not self._tick or self._tick < message.stamp <= self._tick + _STEPS * TICK):
+        follows = not self._tick or self._tick < message.stamp <= self._tick + _STEPS * TICK
+        if topic is EPISODE and follows and message.stamp % TICK == 0:
             self._tick = message.stamp
             self.heard += 1
