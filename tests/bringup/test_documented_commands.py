@@ -1,0 +1,60 @@
+"""The commands of the README and the guides, as they stand there, read by the programs' own parsers."""
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import mujoban_core.program
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+_SCRIPTS = {"mujoban-run": "run_stack", "mujoban-evaluate": "evaluate", "mujoban-record": "record"}
+
+
+def commands(page: Path) -> list[str]:
+    """Return the indented command lines of a page, those that go on over several lines as one."""
+    text = page.read_text().replace("\\\n", " ")
+    return re.findall(r"^ {4}((?:python|mujoban-(?:run|evaluate|record)|make) .*)$", text, re.MULTILINE)
+
+
+def program(words: list[str]) -> tuple[str, list[str]]:
+    """Return a command's module and arguments."""
+    if words[0] in _SCRIPTS:
+        return f"bringup.{_SCRIPTS[words[0]]}", words[1:]
+    if words[1] == "-m":
+        return words[2], words[3:]
+    return words[1].removesuffix(".py").replace("/", "."), words[2:]
+
+
+class Read(Exception):
+    """The options were understood."""
+
+
+@pytest.mark.parametrize("command", sorted({c for page in PAGES for c in commands(page) if not c.startswith("make")}))
+def test_a_documented_command_exists_and_understands_its_options(command, monkeypatch):
+    module, arguments = program(shlex.split(command, comments=True))
+    assert importlib.util.find_spec(module) is not None
+    if "--ros-args" in arguments:  # whose options are ROS's
+        return
+    read = mujoban_core.program.read_options
+    found = importlib.import_module(module)
+    if not hasattr(found, "read_options"):  # nodes and benchmarks
+        assert not arguments
+        return
+
+    def read_and_stop(*arguments, **options):
+        read(*arguments, **options)
+        raise Read
+
+    monkeypatch.setattr(found, "read_options", read_and_stop)
+    with pytest.raises(Read):
+        found.main(arguments)
+
+
+def test_a_documented_target_of_make_exists():
+    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    named = {shlex.split(c, comments=True)[1] for page in PAGES for c in commands(page) if c.startswith("make ")}
+    assert {"run", "test"} <= named <= set(targets)
