@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -13,7 +15,7 @@ from mujoban_planner.exploration_env import SHOWN, ExplorationEnvironment, Explo
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore, judge_scout
 from mujoban_planner.explorer import Explorer
 from mujoban_planner.uncertainty import visible
-from mujoban_rl.testing import check_resuming
+from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sokoban.levels import Level, stack_levels
 
@@ -106,6 +108,10 @@ def test_runs_resume_to_the_bit_and_leave_an_explorer(tmp_path, monkeypatch):
     monkeypatch.setattr("mujoban_planner.exploration_mpo._JUDGED", 4)
     check_resuming(lambda path: small(path, target_period=2), tmp_path, stop_at=3, updates=6)
     assert (tmp_path / "whole" / "explorer.safetensors").exists()
+
+
+def test_a_batch_with_nan_is_refused(tmp_path):
+    check_refusal(small(tmp_path), lambda batch: batch._replace(reward=batch.reward * math.nan))
 
 
 def test_looking_pays_where_it_is_rewarded():
