@@ -22,8 +22,8 @@ def make() -> gymnasium.Env:
 
 def main(steps: int) -> None:
     """Train for a number of environment steps and say what an episode brings."""
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.evaluation import evaluate_policy  # pyright: ignore[reportMissingImports]
 
     model = PPO("MlpPolicy", make(), n_steps=min(2048, steps), seed=0, verbose=1)
     model.learn(steps)

@@ -67,7 +67,7 @@ def test_looks_reports_and_views_take_any_estimate(states, seen):
     log = EpisodeLog(0)
     for timed_out in (False, True):
         log.decided(truth, state, 1, timed_out)
-    assert log.result(solved=False, steps=3, episode_return=0.0).failure is not None
+    assert log.result(solved=False, steps=3, episode_return=0.0, last=truth).failure is not None
     assert grid_text(state) and grid_picture(state).ndim == 3
 
 

@@ -83,7 +83,7 @@ def test_a_summary_on_the_terminal_names_lost_seeds_by_cause(capfd):
         assert rate.startswith("solved 0 of 2 (0.0 %, 95 % interval 0.0 to 65.8 %), mean return ")
         assert cause == "lost by time limit: 2 (seeds 1000, 1001)"
         assert privileged.startswith("privileged, told the ground truth: estimator: oracle")
-        assert "2/2" in captured.err
+        assert "2 of 2 episodes ended" in captured.err
 
 
 def test_an_interrupted_evaluation_reports_what_it_has(tmp_path):

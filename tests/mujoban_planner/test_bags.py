@@ -70,7 +70,6 @@ def test_runs_from_bags_alone_make_nothing_else_and_resume_to_the_bit(make, bags
 
 def test_lessons_and_bags_share_a_batch_and_resume_to_the_bit(bags, tmp_path, monkeypatch):
     monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
-    monkeypatch.setattr("mujoban_planner.lesson_source._STOCK_BATCHES", 2)
     trainers = []
 
     def make(path):

@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import save
 from torch import nn
 
+from mujoban_core.files import digest
 from mujoban_estimator.estimator import StateEstimator
 from mujoban_rl import weights as w
 from mujoban_rl.weights import WeightsError, load_weights, record_path, save_weights, usable_device
@@ -77,7 +78,7 @@ def test_weights_that_are_no_numbers_are_refused(small, value):
         module.layers[1].weight[2, 3] = value
     data = save({name: tensor.contiguous() for name, tensor in module.state_dict().items()})
     small.write_bytes(data)
-    change(small, digest=w.digest(small))
+    change(small, digest=digest(small))
     with pytest.raises(WeightsError, match=r"layers\.1\.weight is not finite"):
         load_weights(Small, small)
 
