@@ -51,7 +51,7 @@ def test_levels_that_are_kept_for_tests_are_refused(tmp_path):
 
 
 def imitating(path, bags, share):
-    config = ImitationConfig(channels=8, blocks=1, batch_size=16, buffer=50_000, bag_share=share)
+    config = ImitationConfig(channels=8, blocks=1, batch_size=16, buffer=50_000, levels=16, stock=4, bag_share=share)
     return imitation(config, path, bags=[bags])
 
 
