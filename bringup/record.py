@@ -41,6 +41,8 @@ from mujoban_sokoban.generator import generate_level
 from mujoban_sokoban.solver import solve_level
 
 PROG = "record.py"
+_GRACE = 60.0
+"""Seconds that a process has to finish its bags."""
 _START_STREAM = 2
 """Tells the random stream of starting positions from others that a seed governs."""
 
@@ -173,14 +175,14 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
     difficulties = [job.episodes.difficulty(i) for i in range(len(job.episodes))]
     recorder = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix, world=job.world)
     try:
-        for tick in ticks(policy, world, job.episodes, camera=True, run_seed=job.seed):
-            # Play may be cut short anywhere, but not a message.
-            with StopSignal() as stop:
+        # A signal that cuts play short anywhere may come while an object is deleted, where its exception is lost.
+        with StopSignal() as stop:
+            for tick in ticks(policy, world, job.episodes, camera=True, run_seed=job.seed):
                 recorder.write(tick)
-            stop.check()
-            ended = int((tick.solved | tick.truncated).sum())
-            if ended:
-                on_end(ended)
+                stop.check()
+                ended = int((tick.solved | tick.truncated).sum())
+                if ended:
+                    on_end(ended)
     finally:
         with StopSignal():
             recorder.close()
@@ -244,7 +246,9 @@ def working(jobs: Sequence[Job]) -> Iterator[list[Connection]]:
             for process in processes:
                 process.terminate()
             for process in processes:
-                process.join()
+                process.join(_GRACE)
+                if process.is_alive():
+                    process.kill()
 
 
 def gather(answers: Sequence[Connection], on_end: Callable[[int], None]) -> int:
