@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_core.grid import Instruction
-from mujoban_core.look_around import Scout, ScriptedScout
+from mujoban_core.look_around import WALKS, Scout, ScriptedScout
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.discrete_mpo import Answer, DiscreteMPOLearner, MPOBatch, StepStore
 from mujoban_planner.exploration_env import SHOWN, ExplorationEnvironment, ExplorationReward
@@ -129,7 +129,7 @@ def judge_scout(
         steps += going & (action != Instruction.STAY)
         returns += np.where(going, step.reward, 0.0)
         left = np.where(going, environment.remaining, left)
-        going &= ~step.truncated
+        going &= environment.steps < WALKS
     found = 1.0 - left.sum() / max(int(hidden.sum()), 1)
     means = {"steps": steps.mean(), "looks": looks.mean(), "reward": returns.mean()}
     return {"found": float(found)} | {name: float(value) for name, value in means.items()}

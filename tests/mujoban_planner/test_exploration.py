@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
-from mujoban_core.look_around import LookAroundPlanner, Scout
+from mujoban_core.look_around import WALKS, LookAroundPlanner, Scout
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.exploration_env import SHOWN, ExplorationEnvironment, ExplorationReward
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore, judge_scout
@@ -114,7 +114,7 @@ def test_a_batch_with_nan_is_refused(tmp_path):
     check_refusal(small(tmp_path), lambda batch: batch._replace(reward=batch.reward * math.nan))
 
 
-def test_looking_pays_where_it_is_rewarded():
+def test_looking_pays_where_it_is_rewarded(monkeypatch):
     class Never(Scout):
         def step(self, abstract_state, shown):
             return None
@@ -125,4 +125,6 @@ def test_looking_pays_where_it_is_rewarded():
 
     reward = ExplorationReward()
     assert judge_scout(Never(), reward, 4) == {"found": 0.0, "steps": 0.0, "looks": 0.0, "reward": 0.0}
-    assert judge_scout(Turns(), reward, 4)["reward"] < -4.0
+    # Whoever never stops is stopped, also where all has been seen.
+    monkeypatch.setattr(ExplorationEnvironment, "remaining", property(lambda self: np.zeros(4, np.int64)))
+    assert judge_scout(Turns(), reward, 4)["looks"] == WALKS
