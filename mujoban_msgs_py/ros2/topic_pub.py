@@ -16,6 +16,9 @@ from mujoban_msgs_py.ros2.session import (
 )
 from mujoban_msgs_py.ros2.verbs import Verbs
 
+_MATCHED = 0.2
+"""Seconds that a subscriber has to find the publisher that has found it; what is said before is lost to it."""
+
 
 def add_verb(verbs: Verbs) -> None:
     """Add the verb to the parser."""
@@ -54,6 +57,8 @@ def publish(options: argparse.Namespace) -> int:
         while publisher.get_subscription_count() < wanted:
             print(f"Waiting for at least {wanted} matching subscription(s)...", flush=True)
             session.until(lambda: publisher.get_subscription_count() >= wanted, 1.0)
+        if wanted:
+            session.spin_for(_MATCHED)
         print("publisher: beginning loop", flush=True)
         count = 0
         while True:
