@@ -12,13 +12,12 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
 import torch
-import tyro
 
 from mujoban_baselines.agents import StructuredAgent, TopDownAgent
 from mujoban_baselines.impala import VTraceTrainingConfig
@@ -26,17 +25,29 @@ from mujoban_baselines.mpo import MPOTrainingConfig
 from mujoban_baselines.squares import SquaresTask
 from mujoban_baselines.task import TaskConfig
 from mujoban_baselines.train import MPORunConfig, Parts, VTraceRunConfig, mpo_parts, vtrace_parts
+from mujoban_core.program import read_options, run_command
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo_continuous import MPOConfig
+
+PROG: Final = "benchmarks.golden"
 
 SOLVED: Final = 0.9
 """Share of episodes that must end at the red square."""
 _BETWEEN: Final = 20
 """Updates between two looks at how far it is."""
 _QUICK: Final = MPOTrainingConfig(
-    window=12, warm_up=2, windows=16, replay=12_000, first=1_000, n_step=3, reuse=2.0, rate=1e-3, gamma=0.9,
-    target_period=10, loss=MPOConfig(epsilon_mean=0.03, epsilon_scale=1e-3, initial_temperature=0.3),
+    window=12,
+    warm_up=2,
+    windows=16,
+    replay=12_000,
+    first=1_000,
+    n_step=3,
+    reuse=2.0,
+    rate=1e-3,
+    gamma=0.9,
+    target_period=10,
+    loss=MPOConfig(epsilon_mean=0.03, epsilon_scale=1e-3, initial_temperature=0.3),
 )
 
 
@@ -92,8 +103,9 @@ def learn(name: str, cpu_seconds: float) -> dict[str, Any]:
     return {"solved": curve[-1][1], "steps": source.samples, "cpu_seconds": round(spent, 1), "curve": curve}
 
 
-def main(options: Options) -> int:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Train the agents that are named; return 1 if one has not solved the task."""
+    options = read_options(Options, command_line, PROG, __doc__)
     torch.set_num_threads(1)
     unknown = set(options.agents) - AGENTS.keys()
     if unknown:
@@ -104,7 +116,4 @@ def main(options: Options) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(tyro.cli(Options, prog="benchmarks.golden")))
-    except ValueError as failure:
-        sys.exit(f"golden: error: {failure}")
+    run_command(PROG, main)

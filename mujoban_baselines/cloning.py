@@ -7,9 +7,8 @@ Shape legend: R rows, each of which reads episodes of its own, W ticks of a batc
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -74,41 +73,36 @@ class BagSource(Source[Batch]):
         Raises:
             BagError: If there is no bag at a path, or one lacks a topic.
         """
-        self._sizes, self._window, self._rng = (agent.proprio_size, agent.action_size), config.window, rng
+        self._sizes, self._window = (agent.proprio_size, agent.action_size), config.window
         bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
-        self._rows = [EndlessEpisodes(bags, self._read, rng) for _ in range(config.rows)]
+        self._episodes = EndlessEpisodes(bags, self._read, rng, config.rows)
 
-    def _read(self, bag: Bag, number: int) -> Fields | None:
-        """Return the fields of episode `number` of a bag, [L, ...] each; None behind the last."""
-        ticks = next(islice(episodes(bag, TOPICS), number, None), None)
-        if ticks is None:
-            return None
-        columns = [np.stack(values) for values in list(zip(*ticks, strict=True))[1:]]
-        fields: Fields = dict(zip(FIELDS, columns, strict=True))
-        if (fields["proprio"].shape[1], fields["action"].shape[1]) != self._sizes:
-            raise BagError(f"{bag.path}: expected a bag of the agent's body, with {self._sizes[1]} torques")
-        floats = {name: values.astype(np.float32) for name, values in fields.items() if name != "frame"}
-        return {**fields, **floats, "first": np.arange(len(ticks)) == 0}
+    def _read(self, bag: Bag) -> Iterator[Fields]:
+        """Yield the fields of a bag's episodes, [L, ...] each."""
+        for ticks in episodes(bag, TOPICS):
+            columns = [np.stack(values) for values in list(zip(*ticks, strict=True))[1:]]
+            fields: Fields = dict(zip(FIELDS, columns, strict=True))
+            if (fields["proprio"].shape[1], fields["action"].shape[1]) != self._sizes:
+                raise BagError(f"{bag.path}: expected a bag of the agent's body, with {self._sizes[1]} torques")
+            floats = {name: values.astype(np.float32) for name, values in fields.items() if name != "frame"}
+            yield {**fields, **floats, "first": np.arange(len(ticks)) == 0}
 
     def next_batch(self) -> Batch:
         """Return the next ticks of every row, [R, W, ...] each."""
-        rows = [[row.next() for _ in range(self._window)] for row in self._rows]
-        self.samples += len(rows) * self._window
+        window = [self._episodes.next() for _ in range(self._window)]
+        self.samples += len(self._episodes) * self._window
         return {
-            name: torch.from_numpy(np.stack([np.stack([fields[name][t] for fields, t in row]) for row in rows]))
+            name: torch.from_numpy(np.stack([np.stack([fields[name][t] for fields, t in tick]) for tick in window], 1))
             for name in (*FIELDS, "first")
         }
 
     def state(self) -> State:
-        """Return where each row is."""
-        own = State({"rng": self._rng.bit_generator.state})
-        return State.of({"own": own} | {f"row{i}": row.state() for i, row in enumerate(self._rows)})
+        """Return where the bags are."""
+        return self._episodes.state()
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
-        self._rng.bit_generator.state = state.part("own").values["rng"]
-        for i, row in enumerate(self._rows):
-            row.restore(state.part(f"row{i}"))
+        self._episodes.restore(state)
 
 
 class CloningLearner(Learner[Batch]):

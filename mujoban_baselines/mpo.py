@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from mujoban_baselines.actor import memory_of
 from mujoban_baselines.critics import Critic
 from mujoban_baselines.networks import AgentOutput, RecurrentAgent
-from mujoban_rl.actors import Experience
+from mujoban_rl.actors import ReplayStore
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
@@ -86,32 +86,18 @@ class MPOTrainingConfig:
         return self.windows * (self.window - self.overlap) / self.reuse
 
 
-class ReplayStore:
+class WindowStore(ReplayStore[Batch]):
     """Whole sequences of the last steps, drawn evenly."""
 
     def __init__(self, config: MPOTrainingConfig, generator: torch.Generator) -> None:
         """Hold the replay of a configuration; `generator` draws."""
-        self._config, self._generator = config, generator
         new = config.window - config.overlap
-        self._replay = SequenceReplay(max(config.replay // new, config.windows), config.window)
-
-    def add(self, experience: Experience) -> None:
-        """Take in the sequences of an actor."""
-        self._replay.add(experience.arrays)
+        super().__init__(SequenceReplay(max(config.replay // new, config.windows), config.window), generator)
+        self._windows = config.windows
 
     def sample(self) -> Batch:
         """Return windows, [M, W, ...] each."""
-        return self._replay.sample(self._config.windows, self._generator)
-
-    def state(self) -> State:
-        """Return contents and randomness."""
-        own = State(tensors={"generator": self._generator.get_state()})
-        return State.of({"own": own, "replay": self._replay.state()})
-
-    def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
-        self._generator.set_state(state.part("own").tensors["generator"])
-        self._replay.restore(state.part("replay"))
+        return self.replay.sample(self._windows, self.generator)
 
 
 class MPOLearner(Learner[Batch]):

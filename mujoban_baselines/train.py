@@ -23,7 +23,7 @@ from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAg
 from mujoban_baselines.cloning import BagSource, CloningConfig, CloningLearner
 from mujoban_baselines.critics import AsymmetricCritic, Critic, SymmetricCritic
 from mujoban_baselines.impala import VTraceLearner, VTraceTrainingConfig
-from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, ReplayStore
+from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_core.program import read_options, run_command
 from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
@@ -69,9 +69,7 @@ class MPORunConfig(RunConfig):
 class VTraceRunConfig(RunConfig):
     """A run of V-trace."""
 
-    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(
-        default_factory=lambda: TaskConfig(levels="curriculum")
-    )
+    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(default_factory=lambda: TaskConfig(levels="curriculum"))
     vtrace: VTraceTrainingConfig = field(default_factory=VTraceTrainingConfig)
 
 
@@ -104,10 +102,8 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
     generators = [torch.Generator().manual_seed(seed) for seed in streams]
     plays = task or partial(MujobanTask, config.task)
     factory = partial(make_actor, plays, build, mpo.window, mpo.overlap, critic.sees, config.seed)
-    store = ReplayStore(mpo, generators[0])
-    source = ActorSource(
-        actors.pool(factory), store, steps_per_update=mpo.steps_per_update, first_steps=mpo.first
-    )
+    store = WindowStore(mpo, generators[0])
+    source = ActorSource(actors.pool(factory), store, steps_per_update=mpo.steps_per_update, first_steps=mpo.first)
     return MPOLearner(agent, critic, mpo, generators[1]), source
 
 

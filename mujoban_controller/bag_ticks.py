@@ -10,7 +10,6 @@ Shapes: L ticks of an episode, R rows, K boxes, N rows and columns of the grid, 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -165,30 +164,29 @@ class BagTicks(Iterator[Fields]):
         Raises:
             BagError: If there is no bag at a path, or one lacks a topic.
         """
-        self._config, self._policy, self._rng, self._teacher = config, policy, rng, teacher
+        self._config, self._policy, self._teacher = config, policy, teacher
         bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
-        self._rows = [EndlessEpisodes(bags, self._read, rng) for _ in range(rows)]
+        self._episodes = EndlessEpisodes(bags, self._read, rng, rows)
         self._memory = Recurrent(*policy.initial_memory(rows))
 
-    def _read(self, bag: Bag, number: int) -> Fields | None:
-        """Return the fields of episode `number` of a bag among those of two ticks or more; None behind the last."""
-        long = (ticks for ticks in episodes(bag, TOPICS) if len(ticks) > 1)
-        ticks = next(islice(long, number, None), None)
-        if ticks is None:
-            return None
-        fields = transitions(ticks, self._config)
-        return fields if self._teacher is None else fields | {"label": labels(self._teacher, fields)}
+    def _read(self, bag: Bag) -> Iterator[Fields]:
+        """Yield the fields of a bag's episodes of two ticks or more."""
+        for ticks in episodes(bag, TOPICS):
+            if len(ticks) > 1:
+                fields = transitions(ticks, self._config)
+                yield fields if self._teacher is None else fields | {"label": labels(self._teacher, fields)}
 
     @torch.no_grad()
     def __next__(self) -> Fields:
         """Return one tick of every row with the policy's memory before it, [R, ...] each.
 
         Raises:
-            BagError: As `episodes` and `transitions`, or if no episode has two ticks.
+            BagError: As `episodes` and `transitions`.
+            ValueError: If no episode has two ticks.
         """
-        found = [row.next() for row in self._rows]
+        found = self._episodes.next()
         tick = {name: np.stack([fields[name][t] for fields, t in found]) for name in found[0][0]}
-        fresh = self._policy.initial_memory(len(self._rows))
+        fresh = self._policy.initial_memory(len(found))
         memory = Recurrent(*renew_rows(self._memory, fresh, tick["first"]))
         seen = (torch.from_numpy(tick[name])[:, None] for name in INPUT_FIELDS)
         self._memory = self._policy(*seen, memory=memory).memory
@@ -196,17 +194,13 @@ class BagTicks(Iterator[Fields]):
 
     def state(self) -> State:
         """Return where each row is, with the policy's memory."""
-        memory = {name: m for name, m in zip(MEMORY_FIELDS, self._memory, strict=True)}
-        own = State({"rng": self._rng.bit_generator.state}, memory)
-        return State.of({"own": own} | {f"row{i}": row.state() for i, row in enumerate(self._rows)})
+        memory = State(tensors=dict(zip(MEMORY_FIELDS, self._memory, strict=True)))
+        return State.of({"episodes": self._episodes.state(), "memory": memory})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
-        own = state.part("own")
-        self._rng.bit_generator.state = own.values["rng"]
-        self._memory = Recurrent(*(own.tensors[name] for name in MEMORY_FIELDS))
-        for i, row in enumerate(self._rows):
-            row.restore(state.part(f"row{i}"))
+        self._episodes.restore(state.part("episodes"))
+        self._memory = Recurrent(*(state.part("memory").tensors[name] for name in MEMORY_FIELDS))
 
 
 @torch.inference_mode()

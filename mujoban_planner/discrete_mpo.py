@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_planner.teacher import DISCOUNT
-from mujoban_rl.actors import Experience
+from mujoban_rl.actors import ReplayStore
 from mujoban_rl.engine import Learner, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
@@ -79,41 +79,27 @@ class MPOBatch(NamedTuple):
         return MPOBatch._make(values.to(device, non_blocking=True) for values in self)
 
 
-class StepStore:
+class StepStore(ReplayStore[MPOBatch]):
     """Replay of what actors played: `state`, `instruction`, `reward`, `terminated`, `dropped`."""
 
     def __init__(self, config: MPOSettings) -> None:
         """Start empty."""
         self._config = config
-        length = config.play + config.n_step
-        self.replay = SequenceReplay(max(1, config.replay_steps * config.environments // config.play), length)
-        self._generator = torch.Generator().manual_seed(config.seed)
-
-    def add(self, experience: Experience) -> None:
-        """Take in a sequence of each of an actor's levels."""
-        self.replay.add(experience.arrays)
+        capacity = max(1, config.replay_steps * config.environments // config.play)
+        generator = torch.Generator().manual_seed(config.seed)
+        super().__init__(SequenceReplay(capacity, config.play + config.n_step), generator)
 
     def sample(self) -> MPOBatch:
         """Return a batch with n-step returns."""
         return self._played(self._config.batch_size)
 
     def _played(self, count: int) -> MPOBatch:
-        window = self.replay.sample(count, self._generator, self._config.n_step + 1)
+        window = self.replay.sample(count, self.generator, self._config.n_step + 1)
         reward, terminated, dropped = (window[name][:, :-1] for name in ("reward", "terminated", "dropped"))
         returns = windowed_returns(reward, terminated, dropped, self._config.discount)
         last = window["state"][torch.arange(count), returns.index]
         state, instruction = window["state"][:, 0].float(), window["instruction"][:, 0]
         return MPOBatch(state, instruction, returns.reward, returns.bootstrap, last.float(), returns.valid)
-
-    def state(self) -> State:
-        """Return the replay and what draws from it."""
-        own = State(tensors={"generator": self._generator.get_state()})
-        return State.of({"own": own, "replay": self.replay.state()})
-
-    def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
-        self._generator.set_state(state.part("own").tensors["generator"])
-        self.replay.restore(state.part("replay"))
 
 
 class Answer(Protocol):

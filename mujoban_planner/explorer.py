@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
 from mujoban_core.look_around import FREE, Scout
-from mujoban_planner.exploration_env import CHANNELS, SHOWN
+from mujoban_planner.exploration_env import CHANNELS
 from mujoban_planner.networks import ResidualBlock
 from mujoban_rl.weights import load_weights
 
@@ -77,7 +77,6 @@ class Explorer(nn.Module, Scout):
     def step(self, abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> Instruction | None:
         """Return the likeliest instruction, None where it is not worth its cost; see `Scout.step`."""
         state = np.concatenate([abstract_state, shown[..., None]], -1).astype(np.float32)
-        assert state.shape[-1] == SHOWN + 1
         policy, q = self(torch.from_numpy(state)[None])
         best = int(policy.argmax())
         return Instruction(best) if q[0, best] > 0.0 else None

@@ -25,7 +25,7 @@ from mujoban_planner.push_policy import PushPolicy, images
 from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.validation import success_rates
-from mujoban_rl.actors import ActorOptions, ActorSource, Experience
+from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
 from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
@@ -149,20 +149,18 @@ def _boards(batch: Window, rows: Tensor, at: Tensor) -> BitBoards:
     return BitBoards(wall.view(np.uint64), target.view(np.uint64), box.view(np.uint64), agent)
 
 
-class PushReplay:
+class PushReplay(ReplayStore[Window]):
     """The newest pushes of all actors."""
 
     def __init__(self, config: PushMPOConfig, actors: int) -> None:
         """Make room for the levels of so many actors."""
         self.config = config
         play, self._length = config.play, config.play.steps + config.n_step
-        self._replay = SequenceReplay(
-            max(1, actors * config.replay_steps * play.environments // play.steps), self._length
-        )
+        capacity = max(1, actors * config.replay_steps * play.environments // play.steps)
+        super().__init__(SequenceReplay(capacity, self._length), torch.Generator().manual_seed(config.seed))
         self._builders = [self._builder() for _ in range(actors)]
         self._after: list[dict[str, NDArray[Any]]] = [{} for _ in range(actors)]
         """States after the last push of each actor."""
-        self._generator = torch.Generator().manual_seed(config.seed)
 
     def _builder(self) -> SequenceBuilder:
         return SequenceBuilder(self._length, self.config.n_step)
@@ -177,25 +175,24 @@ class PushReplay:
         for step in range(self.config.play.steps):
             sequence = self._builders[actor].add({name: arrays[name][step] for name in _KEPT})
             if sequence is not None:
-                self._replay.add(sequence)
+                self.replay.add(sequence)
         self._after[actor] = {name: arrays[f"last_{name}"].copy() for name in BOARDS}
 
     def sample(self) -> Window:
         """Return windows of n + 1 successive steps."""
-        return self._replay.sample(self.config.batch_size, self._generator, self.config.n_step + 1)
+        return self.replay.sample(self.config.batch_size, self.generator, self.config.n_step + 1)
 
-    def state(self) -> State:
-        """Return all pushes and the random state."""
-        parts = {"replay": self._replay.state(), "own": State(tensors={"generator": self._generator.get_state()})}
+    def parts(self) -> dict[str, State]:
+        """Return all pushes, those that wait for their sequence, and the random state."""
+        parts = super().parts()
         for i, (builder, after) in enumerate(zip(self._builders, self._after, strict=True)):
             states = State(tensors={name: torch.from_numpy(values) for name, values in after.items()})
             parts[f"actor{i}"] = State.of({"builder": builder.state(), "after": states})
-        return State.of(parts)
+        return parts
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned, of as many actors or not."""
-        self._generator.set_state(state.part("own").tensors["generator"])
-        self._replay.restore(state.part("replay"))
+        super().restore(state)
         for i, builder in enumerate(self._builders):
             if f"actor{i}" in state.values:
                 part = state.part(f"actor{i}")

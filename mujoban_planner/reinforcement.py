@@ -60,7 +60,7 @@ class MoveStore(StepStore):
         played = self._played(config.batch_size - from_bags)
         if self._bags is None or not from_bags:
             return played
-        recorded = recorded_batch(self._bags, from_bags, config.discount, self._generator)
+        recorded = recorded_batch(self._bags, from_bags, config.discount, self.generator)
         return MPOBatch._make(torch.cat(columns) for columns in zip(played, recorded, strict=True))
 
 

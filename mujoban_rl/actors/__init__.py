@@ -10,7 +10,7 @@ A trainer needs two classes of its own: an `Actor` with a picklable factory, and
 from mujoban_rl.actors.actor import Actor, ActorError, ActorFactory, Arrays, Experience
 from mujoban_rl.actors.options import ActorOptions
 from mujoban_rl.actors.pool import ActorPool, Schedule
-from mujoban_rl.actors.source import ActorSource, ExperienceStore, Rollouts
+from mujoban_rl.actors.source import ActorSource, ExperienceStore, ReplayStore, Rollouts
 
 __all__ = [
     "Actor",
@@ -22,6 +22,7 @@ __all__ = [
     "Arrays",
     "Experience",
     "ExperienceStore",
+    "ReplayStore",
     "Rollouts",
     "Schedule",
 ]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from mujoban_rl.actors.actor import Arrays, Experience
 from mujoban_rl.actors.pool import ActorPool
 from mujoban_rl.engine import Scalars, Source, State
+from mujoban_rl.replay import SequenceReplay
 
 BatchT = TypeVar("BatchT")
 _BatchT_co = TypeVar("_BatchT_co", covariant=True)
@@ -122,6 +125,35 @@ class ActorSource(Source[BatchT], Generic[BatchT]):
     def close(self) -> None:
         """End the actors."""
         self.pool.close()
+
+
+class ReplayStore(ABC, Generic[BatchT]):
+    """A replay of sequences, as actors deliver them; subclasses say how batches are drawn."""
+
+    def __init__(self, replay: SequenceReplay, generator: torch.Generator) -> None:
+        """Hold what is kept in `replay`; `generator` draws."""
+        self.replay, self.generator = replay, generator
+
+    def add(self, experience: Experience) -> None:
+        """Take in the sequences of an actor, [L, B, ...] each."""
+        self.replay.add(experience.arrays)
+
+    @abstractmethod
+    def sample(self) -> BatchT:
+        """Return a batch to learn from."""
+
+    def parts(self) -> dict[str, State]:
+        """Return all that changes, by name."""
+        return {"own": State(tensors={"generator": self.generator.get_state()}), "replay": self.replay.state()}
+
+    def state(self) -> State:
+        """Return contents and randomness."""
+        return State.of(self.parts())
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self.generator.set_state(state.part("own").tensors["generator"])
+        self.replay.restore(state.part("replay"))
 
 
 class Rollouts:
