@@ -110,7 +110,7 @@ def _controller(options: Options) -> list[Stage]:
     common += ("--steps", str(_STEPS), "--evaluate-every", str(_EVALUATED_STEPS), "--evaluation-episodes", str(judged))
     train = "mujoban_controller.train"
     return [
-        _trainer(options, "teacher", (train, "--stage", "teacher", *common), teacher),
+        _trainer(options, "teacher", (train, "--stage", "teacher", "--algorithm", "mpo", *common), teacher),
         _trainer(
             options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common),
             student, "teacher",
