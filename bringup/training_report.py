@@ -54,7 +54,7 @@ def draw_curves(run: Path, names: list[str], path: Path) -> bool:
     figure, axes = plt.subplots(1, len(found), figsize=(4.2 * len(found), 3.4), squeeze=False)
     for axis, (name, curves) in zip(axes[0], found.items(), strict=True):
         for label, points in curves.items():
-            axis.plot(*zip(*points, strict=True), label=label, marker=".")
+            axis.plot(*zip(*points, strict=True), label=label.replace("_", " ").replace("/", ", "), marker=".")
         axis.set(title=name.replace("_", " "), xlabel="CPU seconds of all processes", ylim=(0.0, 1.02))
         axis.legend(fontsize=7)
     axes[0][0].set_ylabel("rate on validation levels")

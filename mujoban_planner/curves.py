@@ -1,9 +1,9 @@
-"""Draw learning curves of runs: `python -m mujoban_planner.curves RUN... --out docs/images/planner_curve.png`."""
+"""Draw learning curves of runs: `python -m mujoban_planner.curves RUN... --names "MPO alone" ...`."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -30,7 +30,9 @@ class Options:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Run directories."""
-    out: Path = Path("docs/images/planner_curve.png")
+    names: tuple[str, ...] = ()
+    """What each run is, for the legend; its folder's name where nothing is given."""
+    out: Path = Path("planner_curve.png")
     """Image to write."""
     difficulty: int = 5
     """Difficulty whose solve rate is drawn."""
@@ -50,24 +52,34 @@ def read_curve(run: Path, difficulty: int) -> list[tuple[float, float, float]]:
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command line."""
     options = read_options(Options, command_line, PROG, __doc__)
+    names = options.names or tuple(run.name for run in options.runs)
     check_file("--out", options.out)
     try:
-        curves = {run.name: read_curve(run, options.difficulty) for run in options.runs}
+        curves = [read_curve(run, options.difficulty) for run in options.runs]
     except OSError as error:
         raise ValueError(f"{reason(error)}, expected run directories of a trainer") from error
+    if len(names) != len(curves):
+        raise ValueError(f"--names: {len(names)} names, expected one for each of the {len(curves)} runs")
+    draw(dict(zip(names, curves, strict=True)), options)
+    return 0
+
+
+def draw(curves: Mapping[str, Sequence[tuple[float, float, float]]], options: Options) -> None:
+    """Draw the curves, each under its name, against samples and against CPU time."""
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
     for name, curve in curves.items():
         for axis, column, scale in ((axes[0], 0, 1e3), (axes[1], 1, 60.0)):
             axis.plot([point[column] / scale for point in curve], [point[2] for point in curve], ".-", label=name)
-    axes[0].set(xlabel="thousand samples", xscale="log", ylabel=f"solve rate, difficulty {options.difficulty}")
-    axes[1].set(xlabel="CPU minutes")
+    axes[0].set(xlabel="thousand samples (logarithmic)", xscale="log")
+    axes[0].set_ylabel(f"success rate, difficulty {options.difficulty}")
+    axes[1].set(xlabel="CPU minutes of training")
     for axis in axes:
         axis.grid(alpha=0.3)
-        axis.set_ylim(0.0, 1.0)
-    axes[0].legend()
+        axis.set_ylim(0.0, 1.02)
+    axes[0].legend(fontsize="small")
     figure.tight_layout()
     figure.savefig(options.out, dpi=110)
-    return 0
+    plt.close(figure)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,8 @@ from benchmarks.paper.runs import ResultError, Run, is_stale, load
 from mujoban_core.grid import DIFFICULTIES
 
 _COLUMNS: Final = 4
+_VARIANTS: Final = {"mpo": "MPO alone, from nothing"}
+"""Other ways to train a module, by the names of their files."""
 
 
 def difficulty(runs: Sequence[Run], file: Path) -> bool:
@@ -50,7 +52,8 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
     if paper:
         axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, Table 1", zorder=3)
     axes.set(xlabel="difficulty", ylabel="success rate", ylim=(0, 1.02), xticks=range(1, 6))
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small")
+    title = "bars: 95 % intervals (Wilson)"
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", title=title, title_fontsize="small")
     figure.savefig(file, dpi=120)
     plt.close(figure)
     return True
@@ -94,12 +97,18 @@ def curves(file: Path) -> list[str]:
         for axes, (module, points) in zip(panels[0], found.items(), strict=False):
             prefix = f"curve_{module}_"
             others = {f.stem.removeprefix(prefix): _points(f) for f in sorted(sources.JSON.glob(f"{prefix}*.jsonl"))}
-            for name, curve in {"shipped": points, **others}.items():
+            variants = {_VARIANTS.get(name, name.replace("_", " ")): curve for name, curve in others.items()}
+            for name, curve in {"weights that ship": points, **variants}.items():
                 steps, values = [p["step"] / 1e6 for p in curve], [p["value"] for p in curve]
                 axes.plot(steps, values, marker=".", markersize=3, label=name)
+            what = {p["what"] for curve in (points, *others.values()) for p in curve}
+            if len(what) > 1:
+                raise ResultError(f"{files[module]}: expected curves of one measure, not of {', '.join(sorted(what))}")
             if others:
-                axes.legend(fontsize="small")
-            axes.set(title=module, xlabel="million samples", ylabel=points[0].get("what", ""))
+                axes.legend(fontsize="small", loc="center right")
+            axes.set(title=module, xlabel="million samples", ylabel=points[0]["what"])
+            if not points[0]["what"].startswith("loss"):
+                axes.yaxis.set_major_formatter(lambda y, _: f"{100 * y:.4g} %")
             axes.grid(alpha=0.3)
         figure.savefig(file, dpi=110)
         plt.close(figure)
@@ -114,8 +123,8 @@ def _margins(report: dict[str, Any]) -> tuple[float, float]:
 def _points(source: Path) -> list[dict[str, Any]]:
     try:
         points = [json.loads(line) for line in source.read_text().splitlines()]
-        if points and all({"step", "value"} <= point.keys() for point in points):
+        if points and all({"step", "value", "what"} <= point.keys() for point in points):
             return points
     except (json.JSONDecodeError, AttributeError):
         pass
-    raise ResultError(f"{source}: expected lines of JSON with step and value; rerun python -m benchmarks.paper.curves")
+    raise ResultError(f"{source}: expected lines with step, value and what; rerun python -m benchmarks.paper.curves")

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 from benchmarks.paper import __main__ as results
-from benchmarks.paper import baselines, curves, film, parts, runs, tables
+from benchmarks.paper import baselines, curves, figures, film, parts, runs, tables
 from bringup.command import Choice, Stack
 from bringup.results import EpisodeResult, report, write_report
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
+from mujoban_planner import curves as planner_curves
 
 ORACLES = Stack({role: Choice(role, "oracle") for role in ROLES})
 EASY = runs.Run("easy", "easy", difficulty=1, oracle=tuple(ROLES))
@@ -131,3 +132,55 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
     row.curve.write_text("{}\n")
     with pytest.raises(runs.ResultError, match=r"rerun python -m benchmarks\.paper\.baselines mpo_easy"):
         results.rebuild(results.Options(folder))
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    monkeypatch.setattr(figures.plt, "close", lambda figure: None)
+    yield lambda: [axes for axes in figures.plt.gcf().axes if axes.has_data()]
+    monkeypatch.undo()
+    figures.plt.close("all")
+
+
+def words(axes):
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def test_figures_name_their_axes_their_bars_and_each_curve_in_words(folder, drawn):
+    write(runs.CONFIGURATIONS[0], 3, 4, {role: digest(shipped_weights(role)) for role in ROLES})
+    assert figures.difficulty(runs.CONFIGURATIONS[:1], folder / "figure2.png")
+    (axes,) = drawn()
+    assert axes.get_legend().get_title().get_text() == "bars: 95 % intervals (Wilson)"
+    for name in ("controller", "controller_mpo", "controller_other_way"):
+        points = [{"step": 1000 * i, "value": i / 3, "what": "instructions completed"} for i in range(4)]
+        (runs.JSON / f"curve_{name}.jsonl").write_text("".join(json.dumps(point) + "\n" for point in points))
+    figures.curves(folder / "figure4.png")
+    (axes,) = drawn()
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("million samples", "instructions completed")
+    assert words(axes) == ["weights that ship", "MPO alone, from nothing", "other way"]
+    assert axes.yaxis.get_major_formatter()(0.5, 0) == "50 %"
+    (runs.JSON / "curve_controller_mpo.jsonl").write_text('{"step": 0, "value": 1.5, "what": "loss"}\n')
+    with pytest.raises(runs.ResultError, match=r"curve_controller\.jsonl: expected curves of one measure"):
+        figures.curves(folder / "figure4.png")
+    (runs.JSON / "curve_controller.jsonl").write_text('{"step": 0, "value": 0.5}\n')
+    with pytest.raises(runs.ResultError, match="expected lines with step, value and what"):
+        figures.curves(folder / "figure4.png")
+
+
+def test_curves_in_the_repository_say_what_they_are_of():
+    for source in sorted(runs.JSON.glob("curve_*.jsonl")):
+        assert len({json.loads(line)["what"] for line in source.read_text().splitlines()}) == 1, source
+
+
+def test_the_planners_curves_have_the_names_that_are_given(tmp_path, drawn):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        lines = [{"step": 10**i, "cpu_seconds": 60.0 * i, "evaluation/success_rate/5": i / 4} for i in range(3, 5)]
+        (tmp_path / name / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    arguments = [str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "curve.png")]
+    assert planner_curves.main([*arguments, "--names", "residual network", "MPO alone"]) == 0
+    samples, minutes = drawn()
+    assert words(samples) == ["residual network", "MPO alone"]
+    assert "samples" in samples.get_xlabel() and minutes.get_xlabel() == "CPU minutes of training"
+    with pytest.raises(ValueError, match="--names: 1 names, expected one for each of the 2 runs"):
+        planner_curves.main([*arguments, "--names", "residual network"])
