@@ -3,7 +3,8 @@
 Bottom-up, as in the paper (section 2, Training): the controller (a teacher by reward, its camera policy by distillation
 and MPO); beside it the planner; bags of both with perfect sense; estimator and termination from these bags; bags of
 all four, and estimator and termination again from both. No weight that ships is read. Stop it at any time: the same
-command goes on. At the end stand `weights/` and `report.md` in the run's directory.
+command goes on. At the end stand `weights/` and `report.md` in the run's directory. With `--continue` another run takes
+up all modules where a finished one has left them.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
+import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
@@ -30,6 +32,15 @@ WEIGHTS: Final = {
     "termination": "estimator_second/weights/termination.safetensors",
 }
 """Where in the run's directory the weights of each module stand."""
+PRODUCTS: Final = {
+    **WEIGHTS,
+    "teacher": "teacher/teacher.safetensors",
+    "student": "controller_distil/controller.safetensors",
+    "whole": "planner/planner.safetensors",
+    "first": "bags_first",
+    "second": "bags_second",
+}
+"""And all that another stage needs: the teacher, its student, the planner of boards in full view, the bags."""
 SHARES: Final = {
     "teacher": 0.05,
     "controller_distil": 0.23,
@@ -60,7 +71,7 @@ _SENSES: Final = ("--streams", "5", "--learner.slip", "0.015", "--learner.lost",
 _VIEWS: Final = ("--noise", "0.1", "--hidden", "0.3")
 """Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
 _STREAMS: Final = {"bags_first": 1, "bags_second": 2}
-"""Each recording draws levels of its own, this many times a billion seeds into those for training."""
+"""Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +82,8 @@ class Options:
     """Directory of everything; an existing one is resumed."""
     hours: float = 8.0
     """Time that the whole run may take on two cores; the budgets of all stages scale with it."""
+    before: Annotated[Path | None, tyro.conf.arg(name="continue")] = None
+    """Directory of a finished run: every module goes on from its weights, and learns also from its bags."""
     world: str = DEFAULT_WORLD
     """Physical world: reference or eased."""
     seed: int = 0
@@ -82,6 +95,9 @@ class Options:
         """Reject times in which nothing can be learned."""
         if not self.hours > 0:
             raise ValueError(f"--hours {self.hours}: expected a positive number")
+        missing = [] if self.before is None else [p for p in PRODUCTS.values() if not (self.before / p).exists()]
+        if missing:
+            raise ValueError(f"--continue {self.before}: lacks {missing[0]}, expected the directory of a finished run")
 
 
 def stages(options: Options) -> list[Stage]:
@@ -91,6 +107,11 @@ def stages(options: Options) -> list[Stage]:
 
 def _seconds(options: Options, name: str) -> float:
     return SHARES[name] * options.hours * 3600.0
+
+
+def _from_before(options: Options, option: str, product: str) -> tuple[str, ...]:
+    """Return the option by which a training begins with weights of the run that is gone on from, if there is one."""
+    return () if options.before is None else (option, str(options.before / PRODUCTS[product]))
 
 
 def _trainer(options: Options, name: str, command: Sequence[str], product: str, *needs: str, cores: int = 1) -> Stage:
@@ -103,17 +124,19 @@ def _trainer(options: Options, name: str, command: Sequence[str], product: str, 
 
 
 def _controller(options: Options) -> list[Stage]:
-    run = options.run
+    run, teacher, student = options.run, PRODUCTS["teacher"], PRODUCTS["student"]
     common = ("--seed", str(options.seed), "--task.world", options.world)
-    teacher, student = "teacher/teacher.safetensors", "controller_distil/controller.safetensors"
     judged = max(4, min(64, round(_JUDGED_PER_HOUR * options.hours)))
     common += ("--steps", str(_STEPS), "--evaluate-every", str(_EVALUATED_STEPS), "--evaluation-episodes", str(judged))
     train = "mujoban_controller.train"
     return [
-        _trainer(options, "teacher", (train, "--stage", "teacher", "--algorithm", "mpo", *common), teacher),
         _trainer(
-            options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common),
-            student, "teacher",
+            options, "teacher", (train, "--stage", "teacher", "--algorithm", "mpo", *common,
+            *_from_before(options, "--initial", "teacher")), teacher,
+        ),
+        _trainer(
+            options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common,
+            *_from_before(options, "--initial", "controller")), student, "teacher",
         ),
         _trainer(
             options, "controller_mpo", (train, "--stage", "mpo", "--initial", str(run / student), *common),
@@ -125,17 +148,18 @@ def _controller(options: Options) -> list[Stage]:
 def _planner(options: Options) -> list[Stage]:
     """Return the stages of the planner: boards in full view, then also boards as an estimator sees them."""
     method = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.seed), "--evaluate-every", "900")
-    whole = "planner/planner.safetensors"
+    whole = PRODUCTS["whole"]
     views = ("--init", str(options.run / whole), "--learning-rate", "7e-4", *_VIEWS)
     return [
-        _trainer(options, "planner", method, whole),
+        _trainer(options, "planner", (*method, *_from_before(options, "--init", "whole")), whole),
         _trainer(options, "planner_views", (*method, *views), WEIGHTS["planner"], "planner"),
     ]
 
 
 def _senses(options: Options) -> list[Stage]:
     found = []
-    bags: list[str] = []
+    bags = [] if options.before is None else [str(options.before / PRODUCTS[name]) for name in ("first", "second")]
+    start = None if options.before is None else options.before / PRODUCTS["estimator"]
     acting = ("controller_mpo", "planner_views")
     for round_, sense in (("first", ("--oracle", "estimator,termination")), ("second", _modules(options, "first"))):
         recording = f"bags_{round_}"
@@ -146,8 +170,9 @@ def _senses(options: Options) -> list[Stage]:
         out = options.run / name / "weights"
         command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out), "--threads", str(options.cores)]
         command += ["--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
-        if round_ == "second":
-            command += ["--start", str(options.run / "estimator_first" / "weights")]
+        if start is not None:
+            command += ["--start", str(start.parent)]
+        start = out / "estimator.safetensors"
         found.append(_trainer(options, name, command, f"{name}/weights", recording, cores=options.cores))
     return found
 
@@ -161,9 +186,10 @@ def _recording(options: Options, name: str, sense: tuple[str, ...], needs: tuple
     run = options.run
     episodes = max(8, round(_EPISODES_PER_HOUR * options.hours))
     acting = tuple(x for role in ("controller", "planner") for x in (f"--{role}", str(run / WEIGHTS[role])))
+    seed = TRAIN_SEEDS.start + (len(_STREAMS) * options.seed + _STREAMS[name]) * 10**9
     command = (
         "-m", "bringup.record", "--out", str(run / name), "--episodes", str(episodes),
-        "--seed", str(TRAIN_SEEDS.start + _STREAMS[name] * 10**9), "--time-limit", str(_RECORDED_STEPS),
+        "--seed", str(seed), "--time-limit", str(_RECORDED_STEPS),
         "--processes", str(options.cores), "--world", options.world, *sense, *acting,
     )  # fmt: skip
     return Stage(name, command, (run / name,), needs, _seconds(options, name), options.cores, resumes=False)

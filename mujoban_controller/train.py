@@ -35,6 +35,7 @@ from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.product import Validation
 from mujoban_core.files import digest
 from mujoban_core.program import read_options, run_command
+from mujoban_msgs_py.bags.training import bags_digest, find_bags
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import load_weights, provenance
@@ -248,6 +249,7 @@ def make_trainer(options: Options) -> Trainer[Any]:
         "data": f"generated levels of difficulty {config.task.difficulty}, seeds of TRAIN_SEEDS",
         "world": config.task.world,
         "bags": [bag.name for bag in options.bags],
+        "bags_digest": bags_digest(find_bags(options.bags)) if options.bags else None,
     }
     on_policy = config.stage == "teacher" and config.algorithm == "ppo"
     cadence = Cadence(

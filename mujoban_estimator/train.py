@@ -15,12 +15,13 @@ from typing import Annotated
 import torch
 import tyro
 
+from mujoban_core.files import digest
 from mujoban_core.program import read_options, run_command
 from mujoban_estimator.bag_source import BagSource, Reading
 from mujoban_estimator.bag_stream import TOPICS
 from mujoban_estimator.data import Batch
 from mujoban_estimator.learner import EstimatorLearner, TrainConfig
-from mujoban_msgs_py.bags.training import find_bags, open_training_bag, require_training_seeds
+from mujoban_msgs_py.bags.training import bags_digest, find_bags, open_training_bag, require_training_seeds
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import provenance
@@ -86,6 +87,8 @@ def make_trainer(options: Options) -> Trainer[Batch]:
         **provenance(),
         "data": [p.name for p in options.bags],
         "bags": len(bags),
+        "bags_digest": bags_digest(bags),
+        "start": None if options.start is None else _digests(options.start),
         "world": ", ".join(sorted(worlds)),
         "training": asdict(config),
     }
@@ -97,6 +100,11 @@ def make_trainer(options: Options) -> Trainer[Batch]:
         Cadence(log_updates=50, evaluate_samples=every, save_seconds=options.save_every),
         record=record,
     )
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of the weights in a folder, by module."""
+    return {role: digest(folder / f"{role}.safetensors") for role in ("estimator", "termination")}
 
 
 def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:

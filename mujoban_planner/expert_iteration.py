@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
+from mujoban_core.files import digest
 from mujoban_planner.imitation import ImitationLearner, LearnerConfig
 from mujoban_planner.samples import Batch
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
@@ -67,6 +68,7 @@ def expert_iteration(
         **provenance(),
         "method": "expert-iteration",
         "training": asdict(config),
+        "init": None if config.init is None else digest(config.init),
         "data": "solutions and verdicts of the planner's own search on generated levels, training seeds; no solver",
     }
     budget = Budget(cpu_seconds=config.cpu_seconds, updates=config.updates)

@@ -16,6 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_core.files import digest
+from mujoban_msgs_py.bags.training import bags_digest, find_bags
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import start_from
 from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
@@ -199,7 +201,9 @@ def imitation(
         "method": "imitation",
         "training": training,
         "data": _data(config, bags),
+        "init": None if config.init is None else digest(config.init),
         "bags": [bag.name for bag in bags],
+        "bags_digest": bags_digest(find_bags(bags)) if bags else None,
     }
     budget = Budget(samples=config.horizon_samples, seconds=config.horizon_seconds)
     return Trainer(run, learner, source, budget, cadence, record=record)

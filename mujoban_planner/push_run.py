@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from mujoban_core.files import digest
 from mujoban_planner.growth import start_from
 from mujoban_planner.push_policy import PushPolicy
 from mujoban_planner.validation import NetworkConfig
@@ -51,4 +52,5 @@ def starting_policy(config: PushRunConfig) -> PushPolicy:
 def training_record(method: str, config: PushRunConfig) -> dict[str, Any]:
     """Return what the weights' record says of a run."""
     data = "own play of generated levels, training seeds; no solver"
-    return {**provenance(), "method": method, "training": asdict(config), "data": data}
+    init = None if config.init is None else digest(config.init)
+    return {**provenance(), "method": method, "training": asdict(config), "init": init, "data": data}

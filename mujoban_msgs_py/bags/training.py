@@ -7,12 +7,14 @@ for episode, values in episode_ticks(bags[0], wanted):
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mujoban_core.files import digest
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.metadata import FILE_NAME
@@ -62,6 +64,16 @@ def open_training_bag(path: Path, wanted: Sequence[Topic], *, skip_damaged: bool
     if missing:
         raise BagError(f"{path} lacks {', '.join(missing)}: expected a bag with {', '.join(t.name for t in wanted)}")
     return bag
+
+
+def bags_digest(bags: Iterable[Path]) -> str:
+    """Return the SHA-256 of bags, by which the record of weights names them: of their names and checksums."""
+    total = hashlib.sha256()
+    for bag in bags:
+        # It has the checksums of all files; a bag that was cut short has none.
+        metadata = bag / FILE_NAME
+        total.update(f"{bag.name}\0{digest(metadata if metadata.is_file() else bag)}\0".encode())
+    return total.hexdigest()
 
 
 def require_training_seeds(bag: Bag) -> None:
