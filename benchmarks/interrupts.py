@@ -7,41 +7,33 @@ memory, a bag that can be read. After SIGKILL only the processes are looked for:
 
 from __future__ import annotations
 
-import fcntl
 import os
-import pty
-import select
 import signal
 import subprocess
 import sys
 import tempfile
-import termios
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 
 from benchmarks.command import run_benchmark
+from benchmarks.running import GIVE_UP, Process, Run, cpu_seconds, family
 from mujoban_core import children
 from mujoban_core.signals import interruptible
 from mujoban_msgs_py.bags import BagError, open_bag
 
-ROOT: Final = Path(__file__).parents[1]
 SHARED: Final = Path("/dev/shm")
 LIMIT: Final = 2.0
 """Seconds within which a command has to end."""
-GIVE_UP: Final = 60.0
-"""Seconds after which a command that does not end is killed."""
 _CPU_SECONDS: Final = (0.5, 15.0)
 """Of the command and its children, before the signal: all of start-up, and some of play."""
 _SHORT: Final = ("--episodes", "1000")
 
-_TICKS: Final = os.sysconf("SC_CLK_TCK")
 MODES: Final[dict[str, tuple[str, ...]]] = {
     "lockstep": ("bringup/run_stack.py", "--headless", "--record", "BAG", *_SHORT),
     "terminal view": ("bringup/run_stack.py", "--record", "BAG", *_SHORT),
@@ -84,131 +76,16 @@ class Try:
     faults: tuple[str, ...]
 
 
-class Run:
-    """A running command, in a terminal of its own or with pipes."""
-
-    def __init__(self, command: list[str], terminal: bool) -> None:
-        """Start the command."""
-        self.terminal = terminal
-        self._ours, theirs = pty.openpty() if terminal else os.pipe()
-        self.process = subprocess.Popen(
-            command, cwd=ROOT, stdin=theirs if terminal else subprocess.DEVNULL, stdout=theirs, stderr=theirs,
-            start_new_session=True, preexec_fn=(lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0)) if terminal else None,
-        )  # fmt: skip
-        os.close(theirs)
-        self._said = bytearray()
-        self._hung_up = threading.Event()
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    @property
-    def last_words(self) -> str:
-        """The last line of what it has said."""
-        return self._said.decode(errors="replace").strip().splitlines()[-1] if self._said.strip() else ""
-
-    def _read(self) -> None:
-        while not self._hung_up.is_set():
-            if not select.select([self._ours], [], [], 0.05)[0]:
-                continue
-            try:
-                data = os.read(self._ours, 65536)
-            except OSError:  # a terminal whose last program has left
-                return
-            if not data:
-                return
-            self._said += data
-
-    def interrupt(self, number: signal.Signals) -> None:
-        """Press Ctrl-C or close the terminal, where there is one; else send the signal."""
-        if self.terminal and number == signal.SIGINT:
-            os.write(self._ours, b"\x03")
-        elif self.terminal and number == signal.SIGHUP:
-            self.close()
-        else:
-            self.process.send_signal(number)
-
-    def __enter__(self) -> Self:
-        """Return the run."""
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Kill the command if it has not ended."""
-        self.process.kill()
-        self.process.wait()
-        self.close()
-
-    def close(self) -> None:
-        """Close the terminal or the pipe."""
-        if not self._hung_up.is_set():
-            self._hung_up.set()
-            self._reader.join()
-            os.close(self._ours)
-
-
-@dataclass(frozen=True)
-class Process:
-    """A process, told from a later one of the same number by its start."""
-
-    pid: int
-    start: str
-
-    @classmethod
-    def of(cls, pid: int) -> Process | None:
-        """Return a process that lives, or None."""
-        fields = _stat(pid)
-        return None if not fields or fields[0] == "Z" else cls(pid, fields[19])
-
-    @property
-    def lives(self) -> bool:
-        """Whether it has not ended."""
-        return Process.of(self.pid) == self
-
-    @property
-    def name(self) -> str:
-        """Its command line, shortened."""
-        try:
-            return Path(f"/proc/{self.pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()[-60:]
-        except OSError:
-            return str(self.pid)
-
-
-def _stat(pid: int) -> list[str]:
-    """Return the fields of /proc/PID/stat from the state on; none if there is no such process."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return []
-
-
-def family(pid: int) -> list[Process]:
-    """Return a process and all that descend from it."""
-    process = Process.of(pid)
-    if process is None:
-        return []
-    found = [process]
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        try:
-            offspring = task.read_text().split()
-        except OSError:
-            continue
-        found += [member for child in offspring for member in family(int(child))]
-    return found
-
-
-def _cpu_seconds(pid: int) -> float:
-    return sum(sum(map(int, _stat(p.pid)[11:13] or ())) for p in family(pid)) / _TICKS
-
-
-def attempt(mode: str, number: signal.Signals, terminal: bool, cpu_seconds: float, folder: Path) -> Try:
+def attempt(mode: str, number: signal.Signals, terminal: bool, at: float, folder: Path) -> Try:
     """Start a command, interrupt it after some CPU time, and look at what is left."""
     bag = folder / "bag"
     with Run([sys.executable, *(str(bag) if part == "BAG" else part for part in MODES[mode])], terminal) as run:
-        return _interrupt(run, number, cpu_seconds, bag)
+        return _interrupt(run, number, at, bag)
 
 
-def _interrupt(run: Run, number: signal.Signals, cpu_seconds: float, bag: Path) -> Try:
+def _interrupt(run: Run, number: signal.Signals, at: float, bag: Path) -> Try:
     deadline = time.monotonic() + 20 * GIVE_UP
-    while _cpu_seconds(run.process.pid) < cpu_seconds and run.process.poll() is None and time.monotonic() < deadline:
+    while cpu_seconds(run.process.pid) < at and run.process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     members = family(run.process.pid)
     shared = {name for member in members for name in _shared_memory(member)}
@@ -225,7 +102,7 @@ def _interrupt(run: Run, number: signal.Signals, cpu_seconds: float, bag: Path) 
         time.sleep(0.02)
     seconds = time.monotonic() - start
     if seconds > LIMIT:
-        faults.append(f"took {seconds:.1f} s, {cpu_seconds:.1f} CPU seconds after the start: {run.last_words}")
+        faults.append(f"took {seconds:.1f} s, {at:.1f} CPU seconds after the start: {run.last_words}")
     faults += [f"left a process: {member.name}" for member in members if member.lives]
     expected = -number if number == signal.SIGKILL else 128 + number
     if status != expected:
