@@ -2,7 +2,7 @@
 # make run    one episode with a live view         make bench  measurements, as JSON
 # make results  the tables and figures of the paper, the model cards
 # make docs   the API reference, in build/docs
-# make test   the test suite                       make colcon  the messages as colcon builds them
+# make test   the test suite                       make colcon  messages and nodes as colcon builds them
 # make weights  all weights from nothing, as in: make weights ARGS="--hours 8 --run runs/all"
 #
 # PYTHON chooses the interpreter for .venv; ARGS are passed on, as in: make run ARGS="--difficulty 1"
@@ -56,9 +56,9 @@ colcon:
 	test -x build/colcon/venv/bin/python || $(PYTHON) -m venv build/colcon/venv
 	build/colcon/venv/bin/python -m pip install --quiet $(COLCON_WHEELS)
 	mkdir -p build/colcon/src && ln -sfn $(CURDIR)/mujoban_msgs_py build/colcon/src/mujoban_msgs
+	ln -sfn $(CURDIR)/bringup/ros_package build/colcon/src/mujoban
 	cd build/colcon && PATH=$$PWD/venv/bin:$$PATH AMENT_PREFIX_PATH=$$PWD/venv CMAKE_PREFIX_PATH=$$PWD/venv \
-	  venv/bin/colcon build --base-paths src --packages-select mujoban_msgs \
-	  --cmake-args -DPython3_EXECUTABLE=$$PWD/venv/bin/python
+	  venv/bin/colcon build --base-paths src --cmake-args -DPython3_EXECUTABLE=$$PWD/venv/bin/python
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks $(ARGS)

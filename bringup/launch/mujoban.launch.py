@@ -1,10 +1,12 @@
-"""`ros2 launch bringup/launch/mujoban.launch.py [module:=oracle] [viz:=false]`: the graph, a process for each node.
+"""`ros2 launch mujoban mujoban.launch.py [module:=oracle] [viz:=false]`: the graph, a process for each node.
 
-For those who have ROS 2; `python bringup/run_stack.py --processes` does the same without it, and restarts nodes.
+For those who have ROS 2, also without a workspace: `ros2 launch bringup/launch/mujoban.launch.py`. Without ROS 2
+`python bringup/run_stack.py --processes` does the same, and restarts nodes.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -14,6 +16,10 @@ from launch.conditions import IfCondition  # pyright: ignore
 from launch.substitutions import LaunchConfiguration  # pyright: ignore
 
 ROOT = Path(__file__).resolve().parents[2]
+OWN = ROOT / ".venv" / "bin" / "python"
+"""The environment that `make setup` makes."""
+MIXING = ("PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
+"""Variables of a ROS 2 that has been sourced; the environment that has mujoban has an rclpy of its own."""
 MODULES = {
     "estimator": "mujoban_estimator.node",
     "termination": "mujoban_estimator.termination_node",
@@ -25,7 +31,7 @@ MODULES = {
 def generate_launch_description() -> LaunchDescription:
     """Return the nodes of the graph, with the parameters of bringup/config/stack.yaml."""
     arguments = {
-        "python": (sys.executable, "interpreter of the environment that has mujoban"),
+        "python": (str(OWN if OWN.exists() else sys.executable), "interpreter of the environment that has mujoban"),
         "params_file": (str(ROOT / "bringup/config/stack.yaml"), "parameters of the nodes"),
         "module": ("learned", "what plays the four modules: learned or oracle"),
         "difficulty": ("5", "of the levels"),
@@ -40,7 +46,8 @@ def generate_launch_description() -> LaunchDescription:
 
     def node(module: str, *parameters: object, **options: object) -> ExecuteProcess:
         command = [value["python"], "-m", module, "--ros-args", "--params-file", value["params_file"], *parameters]
-        return ExecuteProcess(cmd=command, cwd=str(ROOT), output="screen", **options)
+        kept = {name: text for name, text in os.environ.items() if name not in MIXING}
+        return ExecuteProcess(cmd=command, cwd=str(ROOT), env=kept, output="screen", **options)
 
     return LaunchDescription(
         [
