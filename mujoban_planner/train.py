@@ -20,6 +20,7 @@ from mujoban_planner.imitation import ImitationConfig, imitation
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
 from mujoban_planner.reinforcement import MPOConfig, reinforcement
+from mujoban_planner.stages import StagesConfig, train_stages
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
 
@@ -148,6 +149,19 @@ class MPOPushes(_ActorCommand):
 
 
 @dataclass(frozen=True)
+class Stages(_ActorCommand):
+    """Several methods one after the other, each from the weights of the one before."""
+
+    run: Path = Path("runs/planner_stages")
+    """Run directory, with a folder for each stage; an existing one is resumed."""
+    config: tyro.conf.OmitArgPrefixes[StagesConfig] = field(default_factory=StagesConfig)
+
+    def main(self) -> None:
+        """Train."""
+        train_stages(self.config, self.run, self.cadence(), self.actors, self.seconds)
+
+
+@dataclass(frozen=True)
 class ExplorerRun(_ActorCommand):
     """Learn by MPO where to look before pushing."""
 
@@ -168,6 +182,7 @@ def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
         "ppo": PPO,
         "mpo": MPO,
         "mpo-pushes": MPOPushes,
+        "stages": Stages,
         "explorer": ExplorerRun,
     }
     command = read_options(commands, command_line, prog, __doc__)
