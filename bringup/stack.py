@@ -24,6 +24,7 @@ from bringup.parameters import graph_parameters
 from bringup.results import EpisodeResult
 from bringup.video import EDGE, VideoNode
 from mujoban_core import children
+from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.plugins import AGENT, ROLES
 from mujoban_core.signals import StopSignal
@@ -100,7 +101,7 @@ def play(
         realtime=options.realtime,
         time_limit=options.time_limit or 0,
         await_recorder=options.record is not None,
-        top_camera_size=FRAME_SIZE if options.video is None else EDGE,
+        top_camera_size=top_camera_size(stack, options.video is not None),
     )
     with ExitStack() as exits:
         stop = exits.enter_context(StopSignal(deferred=False))
@@ -136,6 +137,17 @@ def play(
         counts = processes.counts() if options.processes else graph.counts()
         counts += Counter({f"monitor: {kind}": n for kind, n in monitor.counts.items()})
         return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts)
+
+
+def top_camera_size(player: Player, filmed: bool) -> int:
+    """Return the pixels along the edge of the view from above.
+
+    An agent may look at it, at the size that it was trained with. For people it has as many to a metre with every body:
+    64 pixels of the ant's world, which is three times as large, show a dot.
+    """
+    if isinstance(player, Solo):
+        return FRAME_SIZE
+    return EDGE if filmed else round(FRAME_SIZE * get_body(player.body).cell_size)
 
 
 def _supervise(processes: Processes, monitor: MonitorNode) -> None:

@@ -10,10 +10,15 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from visualization_msgs.msg import Marker, MarkerArray
 
+from bringup.command import Choice, Solo, Stack
 from bringup.overlay import BAR, CELL, COLOURS, MARGIN, grid_picture
+from bringup.stack import top_camera_size
 from bringup.video import EDGE, VideoNode
 from bringup.viz import VizNode, occupancy_grid
+from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import AGENT, BOX, TARGET, WALL, cell_to_xy
+from mujoban_core.plugins import AGENT as AGENT_ROLE
+from mujoban_core.plugins import ROLES
 from mujoban_msgs_py import conversions, topics
 from mujoban_sim.observation import GLANCE
 from mujoban_sokoban.episodes import Episodes
@@ -128,3 +133,12 @@ def test_the_view_from_above_is_drawn_as_often_as_its_readers_need(play_graph, r
     node.create_subscription(topic.type, topic.name, lambda m: stamps.append(conversions.stamp_of(m)), qos)
     graph.spin_until(lambda: len(stamps) > 12)
     assert set(np.diff(stamps[4:])) == {period * topics.TICK}
+
+
+def test_the_view_from_above_has_as_many_pixels_to_a_metre_with_every_body():
+    modules = {role: Choice(role, "oracle") for role in ROLES}
+    ball, ant = (top_camera_size(Stack(modules, body=body), filmed=False) for body in ("ball", "ant"))
+    assert (ball, ant) == (FRAME_SIZE, 3 * FRAME_SIZE)
+    assert top_camera_size(Stack(modules, body="ant"), filmed=True) == EDGE
+    agent = Solo(Choice.parse(AGENT_ROLE, "random"), body="ant")
+    assert top_camera_size(agent, filmed=True) == FRAME_SIZE, "it may look at it"
