@@ -37,8 +37,9 @@ class AgentActor(Actor):
     """Explores with the agent's distribution over torques.
 
     Delivered are, [L, B, ...] each: what the agent read and what `beside` names; `action` [U], not limited to
-    [-1, 1], and `log_prob` of it; `reward`, `terminated` and `truncated` of the step; `first` before which ticks an
-    episode begins, and the memory before each; for agents with subgoals also `pseudo_reward` and `pseudo_over`.
+    [-1, 1], and `log_prob` of what the world takes of it; `reward`, `terminated` and `truncated` of the step; `first`
+    before which ticks an episode begins, and the memory before each; for agents with subgoals also `pseudo_reward` and
+    `pseudo_over`.
     """
 
     def __init__(
@@ -92,7 +93,7 @@ class AgentActor(Actor):
         sights, memory, others = agent.look(AgentInput(**{name: seen[name] for name in agent.sees}), self._state)
         output = agent(agent.to_tensors(sights), memory)
         action = output.action.sample(self._generator)
-        log_prob = _log_prob(output.action.mean, output.action.scale, action)[:, 0]
+        log_prob = output.action.limited_log_prob(action)[:, 0]
         taken = action[:, 0].numpy()
         step = task.step(taken.clip(-1.0, 1.0))
         kept = {**sights, **{name: seen[name] for name in self._beside}}
@@ -144,11 +145,6 @@ class AgentActor(Actor):
     def close(self) -> None:
         """Free the cameras."""
         self._task.close()
-
-
-def _log_prob(mean: Tensor, scale: Tensor, action: Tensor) -> Tensor:
-    """Return the log-density of actions [..., U], [...]."""
-    return torch.distributions.Normal(mean, scale, validate_args=False).log_prob(action).sum(-1)
 
 
 TaskFactory = Callable[[np.random.Generator], Task]

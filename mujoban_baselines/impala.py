@@ -87,8 +87,8 @@ class VTraceLearner(Learner[Arrays]):
         # Shape [B, T + 1, ...].
         ticks = {name: torch.from_numpy(values).transpose(0, 1) for name, values in batch.items()}
         output = self.agent({name: ticks[name] for name in self.agent.reads}, memory_of(ticks), ticks["first"])
-        policy = Normal(*output.action, validate_args=False)
-        log_prob, entropy = policy.log_prob(ticks["action"]).sum(-1), policy.entropy().sum(-1)
+        log_prob = output.action.limited_log_prob(ticks["action"])
+        entropy = Normal(*output.action, validate_args=False).entropy().sum(-1)
         over = ticks["terminated"] | ticks["truncated"]
         value = self.value(output.features).squeeze(-1)
         # A state from which time ran out is worth what it is held to be, and its step teaches nothing.

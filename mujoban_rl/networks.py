@@ -34,6 +34,17 @@ class Gaussian(NamedTuple):
         noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
         return self.mean + self.scale * noise
 
+    def limited_log_prob(self, action: Tensor) -> Tensor:
+        """Return the log-probability of torques [..., U] as the world takes them, limited to [-1, 1], [...].
+
+        All torques beyond a limit are one to the world, and have the probability of the whole tail. By the density of
+        what was drawn, noise alone would teach a mean that has passed a limit, and drive it away for good (Fujita and
+        Maeda 2018).
+        """
+        normal = torch.distributions.Normal(self.mean, self.scale, validate_args=False)
+        beyond = torch.special.log_ndtr((self.mean * action.sign() - 1.0) / self.scale)
+        return torch.where(action.abs() < 1.0, normal.log_prob(action), beyond).sum(-1)
+
 
 def gaussian_layers(features: int, actions: int) -> tuple[nn.Linear, nn.Linear]:
     """Return the layers for mean and scale, which begin close to zero and to `INITIAL_SCALE`."""

@@ -14,7 +14,7 @@ from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAg
 from mujoban_baselines.critics import Critic
 from mujoban_baselines.impala import VTraceTrainingConfig
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig
-from mujoban_baselines.networks import AgentOutput, Recurrent
+from mujoban_baselines.networks import AgentOutput, BodySense, Recurrent, RecurrentAgent, dense
 from mujoban_baselines.squares import SquaresTask
 from mujoban_baselines.task import LEVELS, MujobanTask, TaskConfig
 from mujoban_baselines.train import MPORunConfig, VTraceRunConfig, main, make_trainer, mpo_parts, vtrace_parts
@@ -169,3 +169,41 @@ def test_symmetric_critics_teach_the_torso_and_asymmetric_ones_do_not():
         loss.backward()
         moved[critic] = any(p.grad is not None and bool(p.grad.any()) for p in agent.parameters())
     assert moved == {"symmetric": True, "asymmetric": False}
+
+
+class TellingSquares(SquaresTask):
+    """Says where the squares are, so that little is to be learned from frames."""
+
+    def observe(self, names):
+        places = np.concatenate([*self._places.values(), np.zeros((self.batch, 10))], 1, dtype=np.float32)
+        return super().observe(names) | {"proprio": places}
+
+
+class Informed(RecurrentAgent):
+    """Reads what it is told."""
+
+    sees = ("proprio",)
+
+    def __init__(self, body="ball"):
+        super().__init__(body, 128, 64, [128])
+        self.body_sense, self.encoder = BodySense(body, pose=False), dense(6, 128, 128)
+
+    @property
+    def sense(self):
+        return self.body_sense
+
+    def embed(self, sights):
+        return self.encoder(sights["proprio"][:, :6])
+
+
+def test_v_trace_learns_to_walk_to_the_red_square_from_nothing():
+    """The golden task without pixels, by the code that trains the agents of Table 1."""
+    unroll = VTraceTrainingConfig(unroll=10, rate=3e-3, gamma=0.9)
+    config = VTraceRunConfig(task=TaskConfig(robots=16), vtrace=unroll)
+    learner, source = vtrace_parts(config, Informed, ActorOptions(), partial(TellingSquares, batch=16))
+    for update in range(200):
+        source.publish(learner.weights(), update)
+        learner.update(source.next_batch(), update / 400, NaNGuard())
+        if update == 100:
+            source.statistics()
+    assert source.statistics()["solved"] > 0.8, "by chance half of the squares that are reached are red"
