@@ -35,6 +35,7 @@ class RecorderNode(Node):
     Parameters:
         path: Folder of the bag, which must not exist yet.
         episodes_per_file: Episodes after which the next file of the bag begins.
+        instructed: Whether four modules play; if not, an agent, of which there are torques alone.
         body, world: Of the robot and of the physics, which the bag names; empty: it does not.
 
     Attributes:
@@ -52,6 +53,8 @@ class RecorderNode(Node):
         path = declare(self, "path", "bag", described("folder of the bag, which must not exist yet", fixed=True))
         count = described("episodes after which the next file of the bag begins", fixed=True, low=1, high=MOST_EPISODES)
         episodes_per_file = declare(self, "episodes_per_file", 32, count)
+        whose = described("whether modules give instructions; an agent alone does not", fixed=True)
+        self._answers = MODULE_TOPICS if declare(self, "instructed", True, whose) else (topics.TORQUE,)
         about = {
             "body": declare(self, "body", "", described("the robot's body, for the bag to name", fixed=True)),
             "world": declare(self, "world", "", described("the physical world, for the bag to name", fixed=True)),
@@ -90,7 +93,7 @@ class RecorderNode(Node):
         return receive
 
     def _missing(self, stamp: int) -> list[str]:
-        expected = SIMULATOR_TOPICS if stamp in self._last_ticks else (*SIMULATOR_TOPICS, *MODULE_TOPICS)
+        expected = SIMULATOR_TOPICS if stamp in self._last_ticks else (*SIMULATOR_TOPICS, *self._answers)
         return [topic.name for topic in expected if topic.name not in self._ticks[stamp]]
 
     def _write_if_complete(self, stamp: int) -> None:

@@ -42,6 +42,16 @@ class Watched(NamedTuple):
     """Topic name -> what the topic's reader made of the message."""
 
     @property
+    def alone(self) -> bool:
+        """Whether an agent plays, which decides nothing that could be looked at."""
+        return topics.INSTRUCTION.name not in self.values
+
+    @property
+    def torque(self) -> NDArray[np.float32]:
+        """a_tau of an agent that plays alone, [U]."""
+        return self.values[topics.TORQUE.name]
+
+    @property
     def instruction(self) -> conversions.InstructionReading:
         """A."""
         return self.values[topics.INSTRUCTION.name]
@@ -157,7 +167,7 @@ class MonitorNode(Node):
     def _on_tick(self, tick: Watched) -> None:
         self.latest = tick
         self.ticks += 1
-        said = tick.instruction if topics.INSTRUCTION.name in tick.values else None
+        said = None if tick.alone else tick.instruction
         if said is not None and said.sequence != self._sequence:
             self._sequence = said.sequence
             self._log.decided(tick.truth, tick.estimate, said.direction, tick.termination.timed_out)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 from tyro.conf import arg
 
 from bringup.command import import_from_here, recorded_seed
-from bringup.options import INTERFACE, SPEED, Count, EpisodeOptions, FilePath, FolderPath, ModuleOptions
+from bringup.options import INTERFACE, SPEED, Count, EpisodeOptions, FilePath, FolderPath, PlayerOptions
 from mujoban_core.files import check_file, check_folder
 from mujoban_core.program import called, read_options, run_command
 
@@ -26,7 +26,7 @@ class Options:
     """Play Mujoban through the ROS graph; without options, one hard episode."""
 
     play: Annotated[EpisodeOptions, arg(name="")] = field(default_factory=EpisodeOptions)
-    modules: Annotated[ModuleOptions, arg(name="")] = field(default_factory=ModuleOptions)
+    modules: Annotated[PlayerOptions, arg(name="")] = field(default_factory=PlayerOptions)
     realtime: Annotated[float, SPEED] = 0.0
     """Pace the world by the clock, SPEED (1) times as fast as reality, instead of in lockstep."""
     processes: bool = False
@@ -52,7 +52,7 @@ class Options:
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = read_options(Options, command_line, called(PROG))
-    play, stack = options.play, options.modules.stack(options.play.body)
+    play, stack = options.play, options.modules.player(options.play.body)
     import_from_here()
     seed = recorded_seed(play.seed, records=options.record is not None, allow_test_seeds=options.allow_test_seeds)
     check_folder("--record", options.record)

@@ -118,9 +118,9 @@ def play(
         stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:
-            listeners.append(graph.add(_recorder(options.record, options, stack.body)))
+            listeners.append(graph.add(_recorder(options.record, options, stack.body, instructed=not alone)))
         if options.video is not None:
-            listeners.append(graph.add(VideoNode(options.video)))
+            listeners.append(graph.add(VideoNode(options.video, alone=alone)))
         if options.view is not None:
             exits.enter_context(viewer(options.view))
         if options.processes:
@@ -184,8 +184,9 @@ def viewer(address: str) -> Iterator[None]:
         children.stop([process])
 
 
-def _recorder(path: Path, options: PlayOptions, body: str) -> RecorderNode:
+def _recorder(path: Path, options: PlayOptions, body: str, *, instructed: bool) -> RecorderNode:
     values = {
         "path": str(path), "episodes_per_file": options.episodes_per_file, "body": body, "world": options.world,
+        "instructed": instructed,
     }  # fmt: skip
     return RecorderNode(parameter_overrides=[Parameter(name, value=value) for name, value in values.items()])

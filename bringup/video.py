@@ -58,8 +58,13 @@ class VideoNode(Node):
         written: Stamp of the latest picture [ns].
     """
 
-    def __init__(self, path: Path, **options: Unpack[NodeOptions]) -> None:
+    def __init__(self, path: Path, *, alone: bool = False, **options: Unpack[NodeOptions]) -> None:
         """Open the file.
+
+        Args:
+            path: Of the video.
+            alone: Whether an agent plays alone, and there are no modules whose word could be waited for.
+            **options: Of the node.
 
         Raises:
             ValueError: If its name does not end in .mp4.
@@ -80,7 +85,8 @@ class VideoNode(Node):
         self._waiting: dict[int, _Picture] = {}
         self._said: dict[int, Said] = {}
         self._latest: Said | None = None
-        for handle, parts in ((self._on_seen, _SEEN), (self._on_said, _SAID)):
+        self._patience = 0 if alone else PATIENCE
+        for handle, parts in ((self._on_seen, _SEEN), (self._on_said, _SAID))[: 1 if alone else 2]:
             join: Synchroniser[Any] = Synchroniser([topic.name for topic in parts])
             for topic, decode in parts.items():
                 listen(self, topic, self._receiver(join, topic.name, handle), qos=live_qos(256), decode=decode)
@@ -104,7 +110,7 @@ class VideoNode(Node):
             parts = join.add(name, message.stamp, message.content)
             if parts is not None:
                 handle(message.stamp, parts)
-                self._write(PATIENCE)
+                self._write(self._patience)
 
         return receive
 

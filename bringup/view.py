@@ -21,6 +21,7 @@ from bringup.monitor import MonitorNode, Watched
 from bringup.results import EpisodeResult
 from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, TARGET, WALL, Instruction
 from mujoban_core.plugins import is_privileged
+from mujoban_msgs_py.conversions import InstructionReading
 
 ARROWS = {
     Instruction.STAY: "●",
@@ -73,14 +74,13 @@ def live_view(
 
     Args:
         episode: The episode.
-        tick: What the modules said.
+        tick: What the modules, or the agent, said.
         outcomes: Of the episodes before.
         weights: Name of each module -> what identifies it, see `bringup.command.Stack.identities`.
         width: Columns of the terminal; with fewer than `WIDE` the maps stand below the instruction.
     """
     if episode is None or tick is None:
         return Text("waiting for the graph ...")
-    said = tick.instruction
     facts = {
         "episode": str(episode.episode),
         "seed": str(episode.seed),
@@ -90,23 +90,31 @@ def live_view(
         "return": f"{episode.episode_return:+.0f}",
         "on target": str(episode.boxes_on_target),
         "solved": f"{sum(r.solved for r in outcomes)} of {len(outcomes)}",
-        "termination": f"p = {tick.termination.probability:.2f}",
     }
-    arrow = Text(f"{ARROWS[Instruction(said.direction)]}  {Instruction(said.direction).name.lower()}", "bold green")
-    arrow.append(f"   number {said.sequence}", "bright_black")
-    maps = [
-        Panel(grid_text(state), title=title, height=12, width=24)
-        for title, state in (("estimate", tick.estimate), ("ground truth", tick.truth))
-    ]
+    states = {"ground truth": tick.truth}
+    if tick.alone:
+        title, decided = "torque", Text(" ".join(f"{torque:+.2f}" for torque in tick.torque), "bold green")
+    else:
+        title, decided = "instruction", _decided(tick.instruction)
+        facts["termination"] = f"p = {tick.termination.probability:.2f}"
+        states = {"estimate": tick.estimate, **states}
+    maps = [Panel(grid_text(state), title=name, height=12, width=24) for name, state in states.items()]
     told = [role for role, name in (weights or {}).items() if is_privileged(name)]
     last = Text(f"privileged, told the ground truth: {', '.join(told)}" if told else "", "yellow")
     if width < WIDE:
         pairs = [Text.assemble((f"{name} ", "bright_black"), value) for name, value in facts.items()]
-        return Group(arrow, Columns(pairs), Columns(maps), last)
+        return Group(decided, Columns(pairs), Columns(maps), last)
     table = Table.grid(padding=(0, 1))
     for name, value in facts.items():
         table.add_row(Text(name, "bright_black"), value)
-    return Group(Columns([Panel(Group(arrow, table), title="instruction", height=12, width=30), *maps]), last)
+    return Group(Columns([Panel(Group(decided, table), title=title, height=12, width=30), *maps]), last)
+
+
+def _decided(said: InstructionReading) -> Text:
+    """Return an instruction with its number."""
+    direction = Instruction(said.direction)
+    text = Text(f"{ARROWS[direction]}  {direction.name.lower()}", "bold green")
+    return text.append(f"   number {said.sequence}", "bright_black")
 
 
 @contextmanager

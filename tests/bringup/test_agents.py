@@ -1,15 +1,21 @@
 """Agents that play alone: on the same levels, with the same report, seeing what they ask for and nothing else."""
 
+import json
+
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from bringup import run_stack
 from bringup.command import Choice, Solo
 from bringup.evaluate import evaluate, main
 from bringup.results import Failure
 from bringup.stack import PlayOptions, play
 from mujoban_core.agent import Agent, AgentInput, AgentPolicy
 from mujoban_core.interfaces import GroundTruth, Observation
+from mujoban_msgs_py.bags import open_bag
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import TRAIN_SEEDS
 from mujoban_sokoban.levels import Level, write_levels
 
 
@@ -122,6 +128,23 @@ def test_an_agent_plays_through_the_graph_as_it_does_in_a_rollout():
         outcome = play(solo, episodes, PlayOptions(time_limit=25))
         assert outcome.results == evaluate(solo.policy(), episodes, time_limit=25)
         assert outcome.ticks == 50 and not any("foreign" in event for event in outcome.counts)
+
+
+def test_an_agent_is_played_filmed_and_recorded_in_the_place_of_the_modules(tmp_path, capfd):
+    report, bag, film = tmp_path / "out.json", tmp_path / "bag", tmp_path / "film.mp4"
+    played = ["--agent", "random", "--difficulty", "1", "--time-limit", "10", "--seed", str(TRAIN_SEEDS.start)]
+    kept = ["--json", str(report), "--record", str(bag), "--video", str(film)]
+    assert run_stack.main([*played, *kept]) == 0
+    out = capfd.readouterr().out
+    assert "torque" in out and "ground truth" in out and "solved 0 of 1" in out
+    content = json.loads(report.read_text())
+    assert content["weights"] == {"agent": "random"} and content["episodes"][0]["steps"] == 10
+    assert not content["counts"], "nothing was missed, and nothing was late"
+    held = {name: info.count for name, info in open_bag(bag).topics.items()}
+    assert held["/torque"] == 10 and held["/camera/image_raw"] == 11 and not held.get("/instruction")
+    assert imageio.get_reader(film).count_frames() == 11
+    with pytest.raises(ValueError, match=r"--agent random --planner: expected one of the two"):
+        run_stack.main(["--agent", "random", "--planner", "oracle"])
 
 
 class MapReader(Eastward):

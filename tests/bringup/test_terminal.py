@@ -3,6 +3,7 @@
 import io
 import re
 
+import numpy as np
 import pytest
 from mujoban_msgs.msg import EpisodeTruth
 from rich.console import Console
@@ -41,6 +42,16 @@ def test_the_table_of_episodes_shows_every_number_whole(width):
     (lost,) = [line.split() for line in lines if "1000000007" in line]
     assert lost[-5:] == ["-120", "2400", "128", "12", "34"]
     assert "controller" in lost or "controller" in "".join(lines)
+
+
+@pytest.mark.parametrize("width", [60, 80])
+def test_of_an_agent_without_modules_the_live_view_shows_torques_and_the_truth(width):
+    state = Level.from_text("######\n#+$*.#\n#   $#\n######\n").abstract_state()
+    values = {topics.TORQUE.name: np.array([0.25, -1.0], np.float32), topics.TRUE_ABSTRACT_STATE.name: state}
+    episode = EpisodeTruth(episode=3, seed=LOST.seed, difficulty=5, step=1234, episode_return=-12.0)
+    text = " ".join(printed(live_view(episode, Watched(values), [], {"agent": "random"}, width=width), width))
+    assert "+0.25 -1.00" in text and "ground truth" in text
+    assert "estimate" not in text and "instruction" not in text and "termination" not in text
 
 
 @pytest.mark.parametrize("width", [60, 80])
