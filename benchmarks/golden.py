@@ -52,7 +52,7 @@ _QUICK: Final = MPOTrainingConfig(
 
 
 _ROBOTS: Final = 16
-_UNROLL: Final = VTraceTrainingConfig(unroll=10, rate=1e-3, gamma=0.9)
+_UNROLL: Final = VTraceTrainingConfig(unroll=10, rate=5e-4, gamma=0.9)
 
 
 def _mpo(critic: Any) -> Parts:
