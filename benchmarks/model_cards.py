@@ -15,6 +15,7 @@ from typing import Any, Final
 from benchmarks.paper.runs import ALL, ROOT, load
 from mujoban_core.files import write_atomically
 from mujoban_core.program import read_options, run_command
+from mujoban_core.text import readable
 
 CARDS: Final = ROOT / "docs" / "models"
 _WIDTH: Final = 112
@@ -158,7 +159,7 @@ def _scores(record: Mapping[str, Any]) -> Iterator[str]:
     if rows:
         yield "As part of the stack, on levels that no training saw ([results](../results/README.md)):"
         yield _table(("configuration", "oracles", "levels", "solved", "95 % interval"), rows)
-    metrics = [(name, f"{value:.4g}") for name, value in _numbers(record.get("metrics") or {})]
+    metrics = [(name, readable(value)) for name, value in _numbers(record.get("metrics") or {})]
     if metrics:
         yield "On its own, by its trainer's last evaluation:"
         yield _table(("metric", "value"), metrics)

@@ -15,6 +15,7 @@ from matplotlib import pyplot as plt
 
 from bringup.pipeline import Pipeline
 from mujoban_core.files import write_atomically
+from mujoban_core.text import readable
 
 _PREFIX = "evaluation/"
 
@@ -94,11 +95,10 @@ def _stages(run: Path, pipeline: Pipeline) -> Iterator[str]:
     yield "|---|---|---|---|---|"
     for stage in pipeline.stages:
         record = _record(run, stage.products)
-        scores = ", ".join(f"{k} {v:.3g}" for k, v in record.get("metrics", {}).items() if isinstance(v, (int, float)))
-        cells = (
-            stage.name, f"{pipeline.entries[stage.name].seconds / 60:.1f}",
-            str(record.get("samples", "")), str(record.get("updates", "")), scores,
-        )  # fmt: skip
+        metrics = record.get("metrics", {})
+        scores = ", ".join(f"{k} {readable(v)}" for k, v in metrics.items() if isinstance(v, (int, float)))
+        done = (readable(record[kind]) if kind in record else "" for kind in ("samples", "updates"))
+        cells = (stage.name, readable(pipeline.entries[stage.name].seconds / 60), *done, scores)
         yield f"| {' | '.join(cells)} |"
 
 
