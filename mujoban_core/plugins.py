@@ -90,7 +90,7 @@ def _make(role: str, interface: type[Made], source: str, weights: Path | None, d
     module = make() if ":" in source or isinstance(make, type) else make(weights, device)
     if not isinstance(module, interface):
         expected = f"{interface.__module__}.{interface.__name__}"
-        raise PluginError(f"{source} is a {type(module).__name__}: the {role} must be a {expected}")
+        raise PluginError(f"{source} is a {type(module).__name__}, expected as {role} a {expected}")
     return module
 
 
@@ -139,6 +139,6 @@ def _resolve(name: str) -> object:
     try:
         return getattr(importlib.import_module(module), attribute)
     except ModuleNotFoundError as error:
-        raise PluginError(f"{name!r}: {error}") from error
+        raise PluginError(f"{name!r}: {error}, expected package.module:Class that Python finds") from error
     except AttributeError as error:
-        raise PluginError(f"{name!r}: {module} has no {attribute}") from error
+        raise PluginError(f"{name!r}: {module} has no {attribute}, expected a class in it") from error

@@ -12,6 +12,7 @@ A program's options are a dataclass; its `main` reads them and is run by `run_co
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -33,6 +34,15 @@ _READER_LEFT: Final = 128 + signal.SIGPIPE
 """Exit status of a command whose output nobody reads on, as that of `head` and its like: as if SIGPIPE had ended it."""
 USAGE_ERROR: Final = 2
 """Exit status of a command whose input was bad."""
+_EXPECTED: Final = {
+    errno.ENOENT: "one that exists",
+    errno.ENOTDIR: "a folder",
+    errno.EISDIR: "a file",
+    errno.EACCES: "one that may be used",
+    errno.EPERM: "one that may be used",
+    errno.EROFS: "a place that can be written to",
+}
+"""What a program expects of a file of which the system says that."""
 _SCRIPTS: Final = "mujoban-"
 """Start of the names of the installed commands."""
 
@@ -85,9 +95,10 @@ def _flushed(command: Callable[[], int]) -> int:
 
 
 def reason(error: Exception) -> str:
-    """Return in one line what an error says; of the system's errors, the file and what is wrong with it."""
+    """Return in one line what an error says; of the system's: the file, what is wrong with it, what was expected."""
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
+        expected = _EXPECTED.get(error.errno or 0)
+        return f"{error.filename}: {error.strerror}" + (f", expected {expected}" if expected else "")
     return " ".join(str(error).split()) or type(error).__name__
 
 
@@ -159,5 +170,5 @@ def _one_line(box: str) -> str:
         return re.sub(r"^(--[\w-]+): ", r"\1 ", wrong[0].lower() + wrong[1:])
     if missing := re.match(r".*[Mm]issing from .*?: (--\S+)", wrong):
         return f"{missing[1]} is missing, expected it with a value"
-    known = [row for part in sections[1:-1] for row in part[1:] if row.startswith("-")]
+    known = dict.fromkeys(row for part in sections[1:-1] for row in part[1:] if row.startswith("-"))
     return f"{wrong[0].lower()}{wrong[1:]}, expected {' or '.join(known) or 'what --help lists'}"

@@ -15,7 +15,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 from mujoban_core.files import check_file
-from mujoban_core.program import read_options, reason, run_command
+from mujoban_core.program import read_options, run_command
 
 PROG = "mujoban_planner.curves"
 
@@ -57,7 +57,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     try:
         curves = [read_curve(run, options.difficulty) for run in options.runs]
     except OSError as error:
-        raise ValueError(f"{reason(error)}, expected run directories of a trainer") from error
+        raise ValueError(f"{error.filename}: expected the metrics of a trainer's run directory") from error
     if len(names) != len(curves):
         raise ValueError(f"--names: {len(names)} names, expected one for each of the {len(curves)} runs")
     draw(dict(zip(names, curves, strict=True)), options)

@@ -48,6 +48,9 @@ class RunDirectory:
     def __init__(self, path: str | Path, config: Any, *, keep: int = 2) -> None:
         """Create the directory, or reopen it when its configuration is the same.
 
+        One in which nothing has been done yet takes a new configuration: a start that failed, for instance at a file
+        that is missing, does not stand in the way of the next.
+
         Args:
             path: Directory; an existing one is resumed.
             config: Dataclass or mapping; what must not change between the bits of a run.
@@ -62,7 +65,7 @@ class RunDirectory:
         self.config: dict[str, Any] = json.loads(json.dumps(fields, default=str))
         self.path.mkdir(parents=True, exist_ok=True)
         file = self.path / "config.json"
-        if file.exists():
+        if file.exists() and any(other != file for other in self.path.iterdir()):
             stored = _read_config(file)
             changed = sorted(k for k in stored.keys() | self.config.keys() if stored.get(k) != self.config.get(k))
             if changed:

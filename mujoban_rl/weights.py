@@ -91,6 +91,16 @@ def save_weights(
     write_atomically(record_path(path), text.encode())
 
 
+def check_weights_exist(path: str | Path) -> None:
+    """Check that there is a weights file.
+
+    Raises:
+        WeightsError: If there is none.
+    """
+    if not Path(path).is_file():
+        raise WeightsError(f"{path}: no such weights file; expected .safetensors written by a train command")
+
+
 def read_record(path: str | Path) -> dict[str, Any]:
     """Return the record beside a weights file.
 
@@ -99,6 +109,7 @@ def read_record(path: str | Path) -> dict[str, Any]:
     """
     file = record_path(path)
     if not file.is_file():
+        check_weights_exist(path)
         raise WeightsError(f"{file}: no record beside the weights; expected a JSON file")
     try:
         content = json.loads(read_bounded(file, RECORD_LIMIT))
@@ -162,8 +173,7 @@ def load_weights(cls: type[ModuleT], path: str | Path, device: str | torch.devic
         WeightsError: If a file is missing or damaged (digest), or class, configuration or shapes do not fit.
     """
     path, chosen = Path(path), usable_device(device)
-    if not path.is_file():
-        raise WeightsError(f"{path}: no such weights file; expected .safetensors written by a train command")
+    check_weights_exist(path)
     record = read_record(path)
     data = read_bounded(path, WEIGHTS_LIMIT)
     if (found := hashlib.sha256(data).hexdigest()) != record["digest"]:

@@ -19,6 +19,7 @@ import numpy as np
 import tyro
 
 from benchmarks.paper import runs as sources
+from benchmarks.paper.curves import read_metrics
 from benchmarks.paper.runs import ROOT, ResultError, Run
 from mujoban_core.files import write_atomically
 from mujoban_core.grid import DIFFICULTIES
@@ -95,10 +96,7 @@ def read_curve(run: Path) -> list[dict[str, Any]]:
     Raises:
         ResultError: If it has no metrics.
     """
-    try:
-        lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    except (OSError, json.JSONDecodeError) as error:
-        raise ResultError(f"{run}: expected the run directory of a trainer ({error})") from error
+    lines = read_metrics(run)
     if not lines:
         raise ResultError(f"{run}: its metrics are empty")
     points = []

@@ -81,11 +81,7 @@ def read_curve(module: str, runs: Sequence[Path], offset: float = 0.0) -> list[d
     """
     lines: list[tuple[float, dict[str, Any]]] = []
     for run in runs:
-        try:
-            metrics = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-        except (OSError, json.JSONDecodeError) as error:
-            raise ResultError(f"{run}: expected the run directory of a trainer ({error})") from error
-        lines += [(offset + line["step"], line) for line in metrics]
+        lines += [(offset + line["step"], line) for line in read_metrics(run)]
         offset = lines[-1][0] if lines else offset
     for measure in MEASURES[module]:
         points = [(step, *value) for step, line in lines if (value := _value(line, measure)) is not None]
@@ -93,6 +89,19 @@ def read_curve(module: str, runs: Sequence[Path], offset: float = 0.0) -> list[d
             return [{"step": round(step), "value": value, "what": measure.what} for step, value in _thin(points)]
     wanted = ", ".join(key for measure in MEASURES[module] for key in measure.keys)
     raise ResultError(f"{', '.join(map(str, runs))}: fewer than {_FEWEST} points of {wanted}")
+
+
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """Return what a trainer has written into `metrics.jsonl`.
+
+    Raises:
+        ResultError: If that is missing or damaged.
+    """
+    try:
+        return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    except (OSError, json.JSONDecodeError) as error:
+        why = "no metrics.jsonl" if isinstance(error, OSError) else f"metrics.jsonl: {error}"
+        raise ResultError(f"{run}: {why}, expected the run directory of a trainer") from error
 
 
 def _value(line: dict[str, Any], measure: Measure) -> tuple[float, float] | None:

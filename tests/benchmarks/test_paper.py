@@ -107,7 +107,7 @@ def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
     assert written == [10, 20, 30, 40, 50, 60, 70, 80]
     with pytest.raises(runs.ResultError, match="fewer than 3 points of evaluation/success_rate/5"):
         curves.read_curve("planner", [tmp_path / "first"])
-    with pytest.raises(runs.ResultError, match="missing: expected the run directory"):
+    with pytest.raises(runs.ResultError, match=r"missing: no metrics\.jsonl, expected the run directory"):
         curves.read_curve("planner", [tmp_path / "missing"])
 
 

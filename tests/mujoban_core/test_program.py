@@ -1,13 +1,15 @@
-"""Programs end without a word where nobody reads what they print."""
+"""Programs end quietly where nobody reads on, and say in one line what is wrong and what was expected."""
 
 import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
-from mujoban_core.program import give_report
+from mujoban_core.program import exit_status, give_report, read_options
 
 PROGRAM = """
 from dataclasses import dataclass
@@ -44,3 +46,27 @@ def test_a_report_is_printed_or_written_but_not_both(tmp_path, capsys):
     give_report({"n": 3}, tmp_path / "report.json")
     assert json.loads(printed) == {"n": 3} and (tmp_path / "report.json").read_text() == printed
     assert not capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("missing.txt", "missing.txt: No such file or directory, expected one that exists"),
+        (".", ".: Is a directory, expected a file"),
+        ("file/below", "file/below: Not a directory, expected a folder"),
+    ],
+)
+def test_what_the_system_says_of_a_file_comes_with_what_was_expected(tmp_path, monkeypatch, capsys, path, said):
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    assert exit_status("program", lambda: len(Path(path).read_text())) == 2
+    assert capsys.readouterr().err == f"program: error: {said}\n"
+
+
+def test_an_option_of_many_subcommands_is_proposed_once():
+    @dataclass
+    class Options:
+        initial: float = 0.0
+
+    with pytest.raises(ValueError, match=r"--initail.*expected --initial FLOAT$"):
+        read_options({"one": Options, "two": Options}, ["one", "--initail", "1"], "program")

@@ -100,3 +100,8 @@ def test_a_device_that_is_not_there_is_named(device):
     with pytest.raises(WeightsError, match=f"device '{device}'"):
         usable_device(device)
     assert usable_device("cpu").type == "cpu"
+
+
+def test_weights_that_are_missing_are_named_and_not_their_record(tmp_path):
+    with pytest.raises(WeightsError, match=r"none\.safetensors: no such weights file; expected \.safetensors"):
+        w.read_record(tmp_path / "none.safetensors")

@@ -111,10 +111,12 @@ def test_only_the_last_checkpoints_are_kept_and_nan_is_never_written(tmp_path):
     assert not (tmp_path / "checkpoint-0000000004.safetensors").exists()
 
 
-def test_run_directory_refuses_another_configuration(tmp_path):
-    RunDirectory(tmp_path, {"lr": 1})
+def test_run_directory_refuses_another_configuration_once_something_was_done(tmp_path):
+    RunDirectory(tmp_path, {"lr": 0})
+    RunDirectory(tmp_path, {"lr": 1}).save(0, modules={})
     with pytest.raises(RunError, match="lr: 1 there, 2 now"):
         RunDirectory(tmp_path, {"lr": 2})
+    RunDirectory(tmp_path, {"lr": 1})
 
 
 def test_a_directory_of_another_kind_of_run_is_refused_by_name(tmp_path):
