@@ -25,6 +25,7 @@ from mujoban_baselines.critics import AsymmetricCritic, Critic, SymmetricCritic
 from mujoban_baselines.impala import VTraceLearner, VTraceTrainingConfig
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
 from mujoban_baselines.task import MujobanTask, TaskConfig
+from mujoban_core.files import digest
 from mujoban_core.program import read_options, run_command
 from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
@@ -133,13 +134,25 @@ def clone_parts(config: CloneRunConfig, bags: Sequence[Path]) -> Parts:
 
 
 def make_trainer(
-    config: RunConfig, parts: Parts, run: Path, cadence: Cadence, method: str, data: str | None = None
-) -> Trainer[Any]:
-    """Make, or resume, a run of a method; `data` says what it learns from, if not from its own play."""
+    config: RunConfig, parts: Parts, run: Path, cadence: Cadence, method: str, *, data: str | None = None,
+    start: Path | None = None,
+) -> Trainer[Any]:  # fmt: skip
+    """Make, or resume, a run of a method.
+
+    Args:
+        config: What must not change between its bits.
+        parts: Learner and source.
+        run: Its directory.
+        cadence: How often it logs, publishes and saves.
+        method: Its name.
+        data: What it learns from, if not from its own play, for the record.
+        start: Weights that it starts from, for the record.
+    """
     directory = RunDirectory(run, {**asdict(config), "method": method})
     record = {
         **provenance(),
         "training": directory.config,
+        "start": None if start is None else digest(start),
         "data": data or f"own play of generated levels ({config.task.levels}), training seeds",
         "world": config.task.world,
     }
@@ -178,8 +191,8 @@ class MonolithicMPO(_Command):
 
     def trainer(self) -> Trainer[Any]:
         """Make or resume the run."""
-        parts = mpo_parts(self.config, self.actors)
-        return make_trainer(self.config, parts, self.run, self.cadence(50, 5), "monolithic-mpo")
+        parts, cadence = mpo_parts(self.config, self.actors), self.cadence(50, 5)
+        return make_trainer(self.config, parts, self.run, cadence, "monolithic-mpo", start=self.config.start)
 
 
 @dataclass(frozen=True)
@@ -196,7 +209,7 @@ class Clone(_Command):
             raise ValueError("--bags is missing, expected bags or folders of bags")
         parts = clone_parts(self.config, self.bags)
         data = f"bags {', '.join(bag.name for bag in self.bags)}"
-        return make_trainer(self.config, parts, self.run, self.cadence(100, 1000), "cloning", data)
+        return make_trainer(self.config, parts, self.run, self.cadence(100, 1000), "cloning", data=data)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Cloning from recorded bags, and MPO that starts from a clone."""
 
+import json
 import math
 from functools import partial
 
@@ -15,6 +16,7 @@ from mujoban_baselines.mpo import MPOTrainingConfig
 from mujoban_baselines.squares import SquaresTask
 from mujoban_baselines.train import CloneRunConfig, MPORunConfig, clone_parts, main, make_trainer, mpo_parts
 from mujoban_core.bodies import BALL
+from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
@@ -72,5 +74,10 @@ def test_torques_are_learned_and_mpo_starts_from_them_with_its_critic(bags, tmp_
     assert all((learner.weights()[name] == values).all() for name, values in before.items()), "the critic learns first"
     learner.update(source.next_batch(), 0.0, NaNGuard())
     assert not all((learner.weights()[name] == values).all() for name, values in before.items())
+    small = ["--robots", "1", "--episode-seconds", "0.5", "--levels", "easy", "--steps", "1", "--seconds", "0"]
+    started = ["--run", str(tmp_path / "mpo"), "--start", str(run / "agent.safetensors")]
+    assert main(["monolithic-mpo", *started, *small]) == 0
+    record = json.loads((tmp_path / "mpo" / "agent.json").read_text())
+    assert record["start"] == digest(run / "agent.safetensors"), "the record tells which weights these come from"
     with pytest.raises(ValueError, match="--bags is missing"):
         main(["clone", "--run", str(tmp_path / "other")])
