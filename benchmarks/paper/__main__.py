@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.command import run_benchmark
-from benchmarks.paper import curves, figures, film, tables
+from benchmarks.paper import bodies, curves, figures, film, tables
 from benchmarks.paper.runs import ALL, CONFIGURATIONS, DIFFICULTY, RESULTS, SEED, Run, is_stale
 from mujoban_sim.rendering import RenderingError
 
@@ -28,6 +28,9 @@ episode.
 TABLE_1 = """The agents that modular RL is compared with ([how each is trained](../baselines.md)). The
 paper trained each for weeks with 256 to 1,000 actors, and reports the best of many settings; here steps and CPU hours
 are what the row was given.
+"""
+FIGURE_5 = """In the reference world, with ground-truth sense, as in the paper; the planner is the one that ships, and
+knows of no body.
 """
 TABLE_2 = """Each configuration replaces modules by oracles.
 """
@@ -69,6 +72,11 @@ def rebuild(options: Options) -> str:
         *_figure_3(folder),
         "## Figure 4: learning curves\n",
         *_figure_4(folder),
+        "## Figure 5: another body, the same planner\n",
+        FIGURE_5,
+        tables.configurations(bodies.RUNS),
+        tables.test_uses(bodies.RUNS),
+        *_figure_5(folder),
     ]
     page = folder / "README.md"
     page.write_text("\n".join(sections))
@@ -113,6 +121,12 @@ def _figure_4(folder: Path) -> list[str]:
         options = " ".join(f"--{module} RUN" for module in missing)
         sections += _missing(f"The curve of {', '.join(missing)}", f"python -m benchmarks.paper.curves {options}")
     return sections
+
+
+def _figure_5(folder: Path) -> list[str]:
+    if bodies.draw(folder / "figure5.png"):
+        return ["![Success rate of ball and ant against difficulty](figure5.png)\n"]
+    return _missing("Figure 5", f"python -m benchmarks.paper.runs --only {' '.join(run.name for run in bodies.RUNS)}")
 
 
 def _missing(what: str, command: str) -> list[str]:

@@ -35,7 +35,7 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
         if chosen:
             x = [run.difficulty for run, _ in chosen]
             y = [report["success_rate"] for _, report in chosen]
-            low, high = zip(*(_margins(report) for _, report in chosen), strict=True)
+            low, high = zip(*(margins(report) for _, report in chosen), strict=True)
             axes.errorbar(
                 x, y, yerr=[low, high], capsize=3, label=label, marker="o", color="tab:blue",
                 linestyle="none" if stale else "-", markerfacecolor="white" if stale else "tab:blue",
@@ -44,10 +44,10 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
         measured = [(d, report) for d in DIFFICULTIES if (report := load(row.run(d))) is not None]
         if measured:
             rates = [report["success_rate"] for _, report in measured]
-            margins = list(zip(*(_margins(report) for _, report in measured), strict=True))
+            bars = list(zip(*(margins(report) for _, report in measured), strict=True))
             label = f"{row.title} ({row.levels})"
             x = [d for d, _ in measured]
-            axes.errorbar(x, rates, yerr=margins, capsize=2, marker=".", linewidth=1, label=label)
+            axes.errorbar(x, rates, yerr=bars, capsize=2, marker=".", linewidth=1, label=label)
     paper = [(run.difficulty, run.paper_success) for run, _ in reports if run.paper_success is not None]
     if paper:
         axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, Table 1", zorder=3)
@@ -115,7 +115,8 @@ def curves(file: Path) -> list[str]:
     return [module for module in MODULES if module not in found]
 
 
-def _margins(report: dict[str, Any]) -> tuple[float, float]:
+def margins(report: dict[str, Any]) -> tuple[float, float]:
+    """Return how far the interval of an evaluation's success rate reaches below and above it."""
     low, high = report["success_interval"]
     return report["success_rate"] - low, high - report["success_rate"]
 

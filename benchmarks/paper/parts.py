@@ -38,7 +38,7 @@ class Part:
             content = json.loads(self.file.read_text())
         except (OSError, json.JSONDecodeError):
             return None
-        return None if is_stale(content) else content
+        return None if is_stale(content, self.run) else content
 
     def start(self) -> subprocess.Popen[bytes]:
         """Measure it in a process of its own."""

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from mujoban_core.bodies import BALL
 from mujoban_core.files import digest
-from mujoban_core.plugins import ROLES, shipped_weights
+from mujoban_core.plugins import PRIVILEGED, ROLES, shipped_weights
 from mujoban_core.program import read_options, run_command
+from mujoban_sim.presets import DEFAULT_WORLD
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 RESULTS: Final = ROOT / "docs" / "results"
@@ -45,6 +47,10 @@ class Run:
     paper_reward: float | None = None
     agent: Path | None = None
     """Weights of an agent that plays in the place of the stack."""
+    body: str = BALL.name
+    world: str = DEFAULT_WORLD
+    controller: Path | None = None
+    """Weights of the controller, where those of another body play."""
 
     @property
     def file(self) -> Path:
@@ -60,7 +66,10 @@ class Run:
         """Return the options of `bringup/evaluate.py` but for levels, seed and report."""
         oracle = ["--oracle", ",".join(self.oracle)] if self.oracle else []
         agent = [] if self.agent is None else ["--agent", str(self.agent)]
-        return ["--difficulty", str(self.difficulty), *oracle, *agent]
+        body = [] if self.body == BALL.name else ["--body", self.body]
+        world = [] if self.world == DEFAULT_WORLD else ["--world", self.world]
+        controller = [] if self.controller is None else ["--controller", str(self.controller)]
+        return ["--difficulty", str(self.difficulty), *oracle, *agent, *body, *world, *controller]
 
 
 SENSE: Final = ("estimator", "termination")
@@ -107,12 +116,13 @@ def read_source(file: Path, keys: tuple[str, ...], rerun: str) -> dict[str, Any]
     return content
 
 
-def is_stale(report: dict[str, Any]) -> bool:
-    """Tell whether a module of the evaluation had other weights than those that ship now."""
+def is_stale(report: dict[str, Any], run: Run | None = None) -> bool:
+    """Tell whether a module of an evaluation, of a run, had other weights than those that ship for it now."""
+    own = {} if run is None or run.controller is None else {"controller": run.controller}
+    told = {role: name.removesuffix(PRIVILEGED) for role, name in report["weights"].items() if role in ROLES}
     return any(
-        len(identity) == DIGEST_LENGTH and identity != digest(shipped_weights(role))
-        for role, identity in report["weights"].items()
-        if role in ROLES
+        len(name) == DIGEST_LENGTH and name != digest(own.get(role) or shipped_weights(role))
+        for role, name in told.items()
     )
 
 
@@ -122,7 +132,7 @@ def is_current(run: Run, episodes: int) -> bool:
         report = load(run)
     except ResultError:
         return False
-    return report is not None and len(report["episodes"]) == episodes and not is_stale(report)
+    return report is not None and len(report["episodes"]) == episodes and not is_stale(report, run)
 
 
 PROG: Final = "benchmarks.paper.runs"
@@ -147,9 +157,9 @@ class Options:
 def rerun(options: Options) -> None:
     """Rerun the evaluations."""
     # Imported here: both need the definitions above.
-    from benchmarks.paper import baselines, film, parts
+    from benchmarks.paper import baselines, bodies, film, parts
 
-    every = (*ALL, *baselines.RUNS)
+    every = (*ALL, *bodies.RUNS, *baselines.RUNS)
     names = [*(run.name for run in every), film.NAME]
     unknown = set(options.only) - set(names)
     if unknown:

@@ -82,7 +82,7 @@ def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
     error = returns.std(ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else float("nan")
     low, high = report["success_interval"]
     return [
-        run.title + (STALE if is_stale(report) else ""),
+        run.title + (STALE if is_stale(report, run) else ""),
         name,
         oracles,
         str(len(returns)),

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.paper import __main__ as results
-from benchmarks.paper import baselines, curves, figures, film, parts, runs, tables
+from benchmarks.paper import baselines, bodies, curves, figures, film, parts, runs, tables
 from bringup.command import Choice, Stack
 from bringup.results import EpisodeResult, report, write_report
 from mujoban_core.files import digest
@@ -35,7 +35,7 @@ def test_without_sources_the_page_names_the_commands_that_make_them(folder, caps
     page = (folder / "README.md").read_text()
     assert "python -m benchmarks.paper.runs --only film_strip" in page
     assert "python -m benchmarks.paper.curves --controller RUN" in page
-    assert page.count("not measured |") == 9, "one row of Table 1, three of Table 2, five of Figure 2"
+    assert page.count("not measured |") == 19, "one row of Table 1, three of Table 2, five of Figure 2, ten of Figure 5"
     assert "no source yet" in capsys.readouterr().err
 
 
@@ -184,3 +184,16 @@ def test_the_planners_curves_have_the_names_that_are_given(tmp_path, drawn):
     assert "samples" in samples.get_xlabel() and minutes.get_xlabel() == "CPU minutes of training"
     with pytest.raises(ValueError, match="--names: 1 names, expected one for each of the 2 runs"):
         planner_curves.main([*arguments, "--names", "residual network"])
+
+
+def test_figure_5_has_both_bodies_and_marks_a_controller_that_is_another_now(folder):
+    shipped = {role: digest(shipped_weights(role)) for role in ROLES}
+    ant = bodies.BODIES["ant"]
+    write(ant[4], 3, 4, {**shipped, "controller": f"{digest(ant[4].controller)} (privileged)"})
+    write(ant[3], 4, 4, {**shipped, "controller": f"{'0' * 64} (privileged)"})
+    assert results.rebuild(results.Options(folder)) == str(folder / "README.md")
+    page = (folder / "README.md").read_text()
+    assert "| ant, by ground truth (privileged), difficulty 5 | `ant_5` |" in page and "| 73.7 % |" in page
+    assert f"| ant, by ground truth (privileged), difficulty 4{tables.STALE} | `ant_4` |" in page
+    assert (folder / "figure5.png").stat().st_size
+    assert ["--body", "ant"] == [o for o in ant[4].options() if o in ("--body", "ant")]

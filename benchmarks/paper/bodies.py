@@ -1,0 +1,64 @@
+"""Figure 5 of the paper: the planner with a controller for each body, what is sensed being known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+
+import matplotlib.pyplot as plt
+
+from benchmarks.paper.figures import margins
+from benchmarks.paper.runs import ROOT, SENSE, Run, load
+from mujoban_core.bodies import ANT, BALL
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_sim.presets import REFERENCE
+
+_PAPER: Final = {BALL.name: 0.818, ANT.name: 0.737}
+"""Success at difficulty 5 (paper A.3)."""
+_CONTROLLERS: Final[dict[str, Path | None]] = {
+    BALL.name: None,
+    ANT.name: ROOT / "mujoban_controller" / "weights" / "teacher_ant.safetensors",
+}
+_TITLES: Final = {
+    BALL.name: "ball, by its camera",
+    ANT.name: "ant, by ground truth (privileged)",
+}
+"""Of the controllers."""
+
+
+def _run(body: str, difficulty: int) -> Run:
+    return Run(
+        f"{body}_{difficulty}", f"{_TITLES[body]}, difficulty {difficulty}", difficulty, SENSE,
+        _PAPER[body] if difficulty == max(DIFFICULTIES) else None, body=body, world=REFERENCE.name,
+        controller=_CONTROLLERS[body],
+    )  # fmt: skip
+
+
+BODIES: Final = {body: tuple(_run(body, d) for d in DIFFICULTIES) for body in _CONTROLLERS}
+"""The evaluations of each body, difficulty 1 to 5, in the reference world."""
+RUNS: Final = tuple(run for runs in BODIES.values() for run in runs)
+
+
+def draw(file: Path) -> bool:
+    """Draw success against difficulty for each body; return False when nothing has been measured."""
+    found = {body: [(run, r) for run in runs if (r := load(run)) is not None] for body, runs in BODIES.items()}
+    if not any(found.values()):
+        return False
+    figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
+    for (body, measured), colour in zip(found.items(), ("tab:blue", "tab:orange"), strict=True):
+        if measured:
+            bars = list(zip(*(margins(report) for _, report in measured), strict=True))
+            rates = [report["success_rate"] for _, report in measured]
+            x = [run.difficulty for run, _ in measured]
+            axes.errorbar(x, rates, yerr=bars, capsize=3, marker="o", color=colour, label=_TITLES[body])
+        axes.scatter([max(DIFFICULTIES)], [_PAPER[body]], marker="x", color=colour, label=f"{body}, paper", zorder=3)
+    axes.set(xlabel="difficulty", ylabel="success rate", ylim=(0, 1.02), xticks=range(1, 6))
+    title = "bars: 95 % intervals (Wilson)"
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", title=title, title_fontsize="small")
+    figure.savefig(file, dpi=120)
+    plt.close(figure)
+    return True
