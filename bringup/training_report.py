@@ -13,20 +13,24 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
+from bringup.model_card import Place, Score, card
 from bringup.pipeline import Pipeline
 from mujoban_core.files import write_atomically
 from mujoban_core.text import readable
 
 _PREFIX = "evaluation/"
+_PLACE = Place("python -m bringup.train_all", None, "levels for validation")
 
 
 def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> Path:
-    """Collect the weights in `weights/`, draw the curves, and write `report.md`; return its path."""
+    """Collect weights and model cards in `weights/`, draw the curves, and write `report.md`; return its path."""
     for role, name in weights.items():
         for source in ((run / name), (run / name).with_suffix(".json")):
             target = run / "weights" / f"{role}{source.suffix}"
             target.parent.mkdir(exist_ok=True)
             shutil.copyfile(source, target)
+        text = card(target, f"weights/{role}.safetensors", _PLACE, _scores(run))
+        write_atomically(target.with_suffix(".md"), text.encode())
     figure = draw_curves(run, [s.name for s in pipeline.stages], run / "curves.png")
     lines = [*_summary(run, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
     if figure:
@@ -70,6 +74,16 @@ def _rates(metrics: Path) -> dict[str, list[tuple[float, float]]]:
     if not metrics.exists():
         return {}
     return {k: v for k, v in evaluations(metrics).items() if all(0.0 <= y <= 1.0 for _, y in v)}
+
+
+def _scores(run: Path) -> list[Score]:
+    """Return what the four modules solved together."""
+    evaluation = run / "evaluation.json"
+    if not evaluation.exists():
+        return []
+    report = json.loads(evaluation.read_text())
+    levels = len(report["episodes"])
+    return [Score("all four modules", "none", levels, report["success_rate"], report["success_interval"])]
 
 
 def _summary(run: Path, pipeline: Pipeline) -> Iterator[str]:

@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 from benchmarks import model_cards
+from bringup.model_card import CardError
 
 
 def test_the_cards_are_up_to_date():
@@ -23,5 +24,5 @@ def test_a_card_that_was_edited_or_lost_its_weights_is_noticed(tmp_path, monkeyp
 def test_weights_that_nobody_described_are_named(tmp_path, monkeypatch):
     monkeypatch.setattr(model_cards, "ROOT", tmp_path)
     (tmp_path / "new.json").write_text(json.dumps({"class": "Mystery"}))
-    with pytest.raises(model_cards.CardError, match=r"new\.json: no text about Mystery"):
+    with pytest.raises(CardError, match=r"new\.json: no text about Mystery"):
         model_cards.card(tmp_path / "new.json")

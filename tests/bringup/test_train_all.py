@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 import mujoban_controller.train
 import mujoban_estimator.train
-from bringup.train_all import PRODUCTS, Options, stages
+from bringup.pipeline import Pipeline
+from bringup.train_all import PRODUCTS, WEIGHTS, Options, stages
+from bringup.training_report import write_report
 from mujoban_core.program import read_options
 
 
@@ -62,3 +65,21 @@ def test_trainers_know_the_options_that_they_are_given(tmp_path: Path, continued
         if command[1] in programs:
             options = read_options(programs[command[1]], command[2:], name)
             assert options.run == tmp_path / "run" / name
+
+
+def test_the_report_stands_beside_weights_with_their_cards(tmp_path: Path) -> None:
+    finished(tmp_path)
+    record = {
+        "class": "ResidualPlanner", "parameters": 1000, "digest": "0" * 64, "command": "python -m train", "config": {},
+        "training": {"seed": 0}, "metrics": {"success_rate/5": 0.75}, "samples": 12, "updates": 3,
+    }  # fmt: skip
+    for path in WEIGHTS.values():
+        (tmp_path / path).with_suffix(".json").write_text(json.dumps(record))
+    outcome = {"success_rate": 0.5, "success_interval": [0.1, 0.9], "mean_return": 7.0}
+    outcome |= {"failures": {}, "episodes": [1, 2]}
+    (tmp_path / "evaluation.json").write_text(json.dumps(outcome))
+    options = Options(run=tmp_path)
+    text = write_report(tmp_path, Pipeline(tmp_path, stages(options)), WEIGHTS).read_text()
+    assert "**50.0%** of 2 validation levels" in text and "success_rate/5 0.75" in text
+    card = (tmp_path / "weights" / "planner.md").read_text()
+    assert "| all four modules | none | 2 | 50.0 % | 10.0 to 90.0 % |" in card and "| success_rate/5 | 0.75 |" in card

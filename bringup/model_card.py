@@ -1,0 +1,206 @@
+"""A model card for weights, made from their record (Mitchell et al. 2019)."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from mujoban_core.text import readable
+
+_WIDTH: Final = 112
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """What a record does not say: it is the same for all weights of a class."""
+
+    title: str
+    does: str
+    sees: str
+    limits: str
+    guide: str
+    """Page in docs/."""
+
+
+_GRID_LIMITS: Final = "levels of up to 10 x 10 cells that look like the generator's; warehouses drawn by this renderer"
+
+PURPOSES: Final[dict[str, Purpose]] = {
+    "StateEstimator": Purpose(
+        "State estimator",
+        "Estimates the probability of wall, target, agent and box in each of the 10 x 10 cells (paper C.1).",
+        "The camera frame and the robot's own pose, from the episode's start on. No ground truth.",
+        f"Cells never in view are guesses. Made for {_GRID_LIMITS}.",
+        "estimator",
+    ),
+    "ControlTermination": Purpose(
+        "Control termination",
+        "Says whether the instruction in force is completed (paper C.4).",
+        "The camera frame, proprioception, the instruction and its own last answer. No pose, no ground truth.",
+        "Relies on dead reckoning: a robot that slips for long, or is moved, misleads it. Knows no box that it "
+        "does not see.",
+        "estimator",
+    ),
+    "PrivilegedPolicy": Purpose(
+        "Privileged teacher of the controller",
+        "Drives a body to carry out instructions, as an oracle and as the teacher of a camera policy; learned from the "
+        "goal task's rewards alone (paper C.3).",
+        "The robot's pose and velocity, the boxes' positions, proprioception and the instruction: ground truth.",
+        "Not for a robot that has only a camera. Made for the world that its record names.",
+        "controller",
+    ),
+    "ResidualPlanner": Purpose(
+        "Planner",
+        "Turns an estimate of the abstract state into the next instruction (paper C.2).",
+        "The estimate of the abstract state and its own decisions of the episode. No camera, no ground truth.",
+        "Solves most levels, not all: what it loses ends nearly always in a state that only search proves dead. Boards "
+        "of 8 x 8 inner cells; more than four boxes were not trained on.",
+        "planner",
+    ),
+    "VisuomotorController": Purpose(
+        "Controller",
+        "Turns an instruction into motor torques (paper C.3).",
+        "The camera frame, proprioception, the instruction and the termination signal. No pose, no ground truth.",
+        "One body and the physics that it was trained in. A box that rests against pegs off its lane is lost to it.",
+        "controller",
+    ),
+}
+
+
+class CardError(ValueError):
+    """A card cannot be made."""
+
+
+class Score(NamedTuple):
+    """What the stack solved with the weights in it."""
+
+    configuration: str
+    oracles: str
+    levels: int
+    success_rate: float
+    interval: tuple[float, float]
+    """Of 95 %."""
+
+
+class Place(NamedTuple):
+    """Where a card stands, and what is said there."""
+
+    made_by: str
+    """The command that writes it."""
+    docs: str | None
+    """Path from the card to the folder docs/, if it is in the same repository."""
+    levels: str
+    """Which levels the scores are of."""
+
+
+def card(path: Path, file: str, place: Place, scores: Sequence[Score] = ()) -> str:
+    """Return the model card for a record.
+
+    Args:
+        path: The record.
+        file: The weights, as the card names them.
+        place: Of the card.
+        scores: What is known of the weights beside their record.
+
+    Raises:
+        CardError: If the record is of a class without a `Purpose`.
+    """
+    record = json.loads(path.read_text())
+    purpose = PURPOSES.get(record["class"])
+    if purpose is None:
+        raise CardError(f"{path}: no text about {record['class']}, expected one in PURPOSES")
+    parts = [
+        f"# {purpose.title}: `{Path(file).name}`",
+        f"Generated from the weights' record by `{place.made_by}`; do not edit.",
+        purpose.does,
+        f"- **May see:** {purpose.sees}\n- **Limits:** {purpose.limits}\n"
+        f"- **How it works and is trained:** {_guide(purpose.guide, place.docs)}",
+        "## Weights\n\n" + _table(("what", "value"), _weights(record, file)),
+        "## Training\n\n" + _table(("what", "value"), _training(record)),
+        f"The command, in which earlier weights of the same name may stand for where it began:\n\n{_command(record)}",
+        "## Scores",
+        *_scores(record, place, scores),
+        "## Configuration\n\n" + _table(("setting", "value"), _settings(record)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _guide(page: str, docs: str | None) -> str:
+    return f"docs/{page}.md" if docs is None else f"[guide]({docs}{page}.md)"
+
+
+def _weights(record: Mapping[str, Any], weights: str) -> list[tuple[str, str]]:
+    return [
+        ("file", f"`{weights}`"),
+        ("class", f"`{record['class']}`"),
+        ("parameters", f"{record['parameters']:,}"),
+        ("digest", f"`{record['digest'][:16]}`"),
+        ("license", "Apache-2.0"),
+    ]
+
+
+def _training(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+    data = record.get("data", "")
+    rows = [("data", ", ".join(data) if isinstance(data, list) else str(data))]
+    if record.get("bags"):
+        bags = record["bags"]
+        rows.append(("bags", str(bags if isinstance(bags, int) else len(bags))))
+    for name in ("method", "teacher", "steps", "updates", "samples", "env_steps", "seconds", "commit", "torch"):
+        if record.get(name) is not None:
+            value = record[name]
+            rows.append((name, f"{value:,}" if isinstance(value, int) else f"`{value}`"))
+    return rows
+
+
+def _command(record: Mapping[str, Any]) -> str:
+    """Return the record's command as an indented block, broken before options."""
+    lines = [""]
+    for word in shlex.split(record["command"]):
+        if word.startswith("--") and len(lines[-1]) + len(word) > _WIDTH - 24:
+            lines.append("   ")
+        lines[-1] = f"{lines[-1]} {shlex.quote(word)}"
+    return " \\\n".join("   " + line for line in lines)
+
+
+def _scores(record: Mapping[str, Any], place: Place, scores: Sequence[Score]) -> Iterator[str]:
+    if scores:
+        yield f"As part of the stack, on {place.levels}:"
+        yield _table(("configuration", "oracles", "levels", "solved", "95 % interval"), [_cells(s) for s in scores])
+    metrics = [(name, readable(value)) for name, value in _numbers(record.get("metrics") or {})]
+    if metrics:
+        yield "On its own, by its trainer's last evaluation:"
+        yield _table(("metric", "value"), metrics)
+    if not scores and not metrics:
+        yield "Not measured yet with these weights."
+
+
+def _cells(score: Score) -> tuple[str, ...]:
+    low, high = (100 * bound for bound in score.interval)
+    solved = f"{100 * score.success_rate:.1f} %"
+    return score.configuration, score.oracles, str(score.levels), solved, f"{low:.1f} to {high:.1f} %"
+
+
+def _settings(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [(name, f"`{value}`") for name, value in _leaves({"network": record["config"], **record["training"]})]
+
+
+def _numbers(tree: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    for name, value in _leaves(tree):
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            yield name, value
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name}.")
+        elif not isinstance(value, list) or len(value) <= 8:
+            yield f"{prefix}{name}", value
+
+
+def _table(header: tuple[str, ...], rows: list[Any]) -> str:
+    lines = [header, ("---",) * len(header), *rows]
+    return "\n".join("| " + " | ".join(str(cell).replace("|", r"\|") for cell in line) + " |" for line in lines)
