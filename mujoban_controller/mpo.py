@@ -29,7 +29,7 @@ from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
 from mujoban_rl.losses.returns import td_target
 from mujoban_rl.networks import Gaussian
-from mujoban_rl.optimise import guarded_step
+from mujoban_rl.optimise import guarded_step, moving_average
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,9 @@ class MPOTrainingConfig:
     explore: float = 0.0
     """Least standard deviation of the torques of every third robot: without it a policy that is sure of itself shows
     the critic nothing else."""
+    average: float = 0.0
+    """Decay of a moving average of the policy, which then acts, is the reference of the trust region, and is what the
+    run makes; 0: the policy itself. Updates from few windows at a constant rate leave noise in a large network."""
     normalised: int = 2_000
     """Updates after which the normalisation of features stays as it is."""
     loss: MPOConfig = field(default_factory=MPOConfig)
@@ -107,6 +110,7 @@ class MPOLearner(ProductLearner[Batch]):
         self.critic = Critic(body)
         self.loss = MPOLoss(policy.action_size, config.loss)
         self.target_policy, self.target_critic = deepcopy(policy), deepcopy(self.critic)
+        self._average = moving_average(policy, config.average) if config.average else None
         self._actuators = torch.from_numpy(feature_layout(get_body(body)).actuators)
         self._policy_adam = torch.optim.Adam(policy.parameters(), config.policy_rate)
         self._critic_adam = torch.optim.Adam(self.critic.parameters(), config.critic_rate)
@@ -115,15 +119,16 @@ class MPOLearner(ProductLearner[Batch]):
 
     @property
     def product(self) -> GoalPolicy:
-        """The online policy."""
-        return self.policy
+        """The online policy, or its moving average."""
+        return self.policy if self._average is None else self._average.module
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """Online and target networks and the dual variables."""
+        """Online and target networks, the dual variables, and the moving average if there is one."""
+        average = {} if self._average is None else {"average": self._average}
         return {
             "policy": self.policy, "critic": self.critic, "duals": self.loss,
-            "target_policy": self.target_policy, "target_critic": self.target_critic,
+            "target_policy": self.target_policy, "target_critic": self.target_critic, **average,
         }  # fmt: skip
 
     @property
@@ -141,8 +146,8 @@ class MPOLearner(ProductLearner[Batch]):
         self._generator.set_state(state.tensors["generator"])
 
     def weights(self) -> Mapping[str, Tensor]:
-        """Return the online policy's."""
-        return self.policy.state_dict()
+        """Return those of the policy that acts."""
+        return self.product.state_dict()
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one step of the critic, and one of the policy unless the batch was refused."""
@@ -157,7 +162,7 @@ class MPOLearner(ProductLearner[Batch]):
             self._normalise(batch)
         self._updates += accepted
         if accepted and self._updates % config.target_period == 0:
-            self.target_policy.load_state_dict(self.policy.state_dict())
+            self.target_policy.load_state_dict(self.product.state_dict())
             self.target_critic.load_state_dict(self.critic.state_dict())
         return stats
 
@@ -181,7 +186,8 @@ class MPOLearner(ProductLearner[Batch]):
         """Take in what is seen, for online and target networks alike: what they compute would differ otherwise."""
         self.critic.normaliser.update(batch["features"][:, 0])
         self.target_critic.normaliser.load_state_dict(self.critic.normaliser.state_dict())
-        for policy in (self.policy, self.target_policy):
+        averages = () if self._average is None else (self._average.module,)
+        for policy in (self.policy, self.target_policy, *averages):
             policy.normalise(batch)
 
     def _as_seen(self, action: Tensor, batch: Mapping[str, Tensor]) -> Tensor:
@@ -215,5 +221,7 @@ class MPOLearner(ProductLearner[Batch]):
             q.flatten(1),
         )
         norm = guarded_step(loss, [self._policy_adam, self._dual_adam], guard, clip=self.config.clip)
+        if norm is not None and self._average is not None:
+            self._average.update_parameters(self.policy)
         named = scalars(stats._asdict())
         return named if norm is None else {**named, "gradient_norm": float(norm)}

@@ -36,7 +36,7 @@ DISTIL = DistilConfig(window=4, windows=2, sequence=4, replay=64, first=16, reus
 STAGES = {
     "ppo": TrainConfig(stage="teacher", algorithm="ppo", task=TASK, ppo=PPOTrainingConfig(length=8, minibatch=16)),
     "mpo": TrainConfig(stage="teacher", algorithm="mpo", task=TASK, mpo=MPO),
-    "asymmetric": TrainConfig(stage="mpo", task=TASK, network=NETWORK, asymmetric=MPO),
+    "asymmetric": TrainConfig(stage="mpo", task=TASK, network=NETWORK, asymmetric=replace(MPO, average=0.9)),
     "distil": TrainConfig(stage="distil", teacher=Path("teacher"), task=TASK, network=NETWORK, distil=DISTIL),
 }
 
