@@ -1,8 +1,10 @@
 """Train an agent of Table 1: `python -m mujoban_baselines.train METHOD --run DIR`.
 
-Methods: monolithic-mpo, clone (what MPO may start from), monolithic-vtrace, structured-vtrace.
+Methods: monolithic-mpo, clone (what MPO may start from), monolithic-vtrace, structured-vtrace; and joint, which
+fine-tunes the modular stack.
 
-Give the directory again to resume a run; it leaves `agent.safetensors`, for `bringup/evaluate.py --agent`.
+Give the directory again to resume a run; it leaves `agent.safetensors`, for `bringup/evaluate.py --agent`, or
+`controller.safetensors` and `planner.safetensors`, for `--controller` and `--planner`.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAg
 from mujoban_baselines.cloning import BagSource, CloningConfig, CloningLearner
 from mujoban_baselines.critics import AsymmetricCritic, Critic, SymmetricCritic
 from mujoban_baselines.impala import VTraceLearner, VTraceTrainingConfig
+from mujoban_baselines.joint.learner import joint_parts
+from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_core.files import digest
@@ -83,6 +87,16 @@ class CloneRunConfig(RunConfig):
     cloning: CloningConfig = field(default_factory=CloningConfig)
 
 
+@dataclass(frozen=True)
+class JointRunConfig(RunConfig):
+    """A joint fine-tuning of planner and controller."""
+
+    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(default_factory=lambda: TaskConfig(robots=32))
+    start: StartingWeights = field(default_factory=StartingWeights)
+    """Weights of the four modules; by default what ships."""
+    joint: Annotated[JointSettings, tyro.conf.arg(name="")] = field(default_factory=JointSettings)
+
+
 Parts = tuple[Learner[Any], Source[Any]]
 """What a trainer drives."""
 
@@ -135,7 +149,7 @@ def clone_parts(config: CloneRunConfig, bags: Sequence[Path]) -> Parts:
 
 def make_trainer(
     config: RunConfig, parts: Parts, run: Path, cadence: Cadence, method: str, *, data: str | None = None,
-    start: Path | None = None,
+    start: str | dict[str, str] | None = None,
 ) -> Trainer[Any]:  # fmt: skip
     """Make, or resume, a run of a method.
 
@@ -146,13 +160,13 @@ def make_trainer(
         cadence: How often it logs, publishes and saves.
         method: Its name.
         data: What it learns from, if not from its own play, for the record.
-        start: Weights that it starts from, for the record.
+        start: Digest of the weights that it starts from, or of each of them by name, for the record.
     """
     directory = RunDirectory(run, {**asdict(config), "method": method})
     record = {
         **provenance(),
         "training": directory.config,
-        "start": None if start is None else digest(start),
+        "start": start,
         "data": data or f"own play of generated levels ({config.task.levels}), training seeds",
         "world": config.task.world,
     }
@@ -191,8 +205,9 @@ class MonolithicMPO(_Command):
 
     def trainer(self) -> Trainer[Any]:
         """Make or resume the run."""
-        parts, cadence = mpo_parts(self.config, self.actors), self.cadence(50, 5)
-        return make_trainer(self.config, parts, self.run, cadence, "monolithic-mpo", start=self.config.start)
+        parts, start = mpo_parts(self.config, self.actors), self.config.start
+        origin = None if start is None else digest(start)
+        return make_trainer(self.config, parts, self.run, self.cadence(50, 5), "monolithic-mpo", start=origin)
 
 
 @dataclass(frozen=True)
@@ -236,11 +251,25 @@ class StructuredVTrace(_Command):
         return make_trainer(self.config, parts, self.run, self.cadence(20, 1), "structured-vtrace")
 
 
+@dataclass(frozen=True)
+class Joint(_Command):
+    """The modular stack fine-tuned: planner and controller together by MPO on the overall reward."""
+
+    config: Annotated[JointRunConfig, tyro.conf.arg(name="")] = field(default_factory=JointRunConfig)
+
+    def trainer(self) -> Trainer[Any]:
+        """Make or resume the run."""
+        config = self.config
+        parts = joint_parts(config.task, config.start, config.joint, config.seed, self.actors)
+        return make_trainer(config, parts, self.run, self.cadence(50, 5), "joint", start=config.start.digests())
+
+
 COMMANDS: dict[str, type[_Command]] = {
     "monolithic-mpo": MonolithicMPO,
     "clone": Clone,
     "monolithic-vtrace": MonolithicVTrace,
     "structured-vtrace": StructuredVTrace,
+    "joint": Joint,
 }
 
 

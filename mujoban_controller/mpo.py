@@ -94,7 +94,10 @@ class _Draws(NamedTuple):
 
 
 class MPOLearner(ProductLearner[Batch]):
-    """Online and target networks, and dual variables."""
+    """Online and target networks, and dual variables.
+
+    Where a batch says in which ticks the policy has `driven`, bool [M, W], it is improved in these alone.
+    """
 
     def __init__(
         self,
@@ -103,11 +106,21 @@ class MPOLearner(ProductLearner[Batch]):
         config: MPOTrainingConfig,
         generator: torch.Generator,
         validation: Validation | None = None,
+        critic: Critic | None = None,
     ) -> None:
-        """Train `policy` in place; `generator` draws the actions of the E-step."""
+        """Train `policy` in place.
+
+        Args:
+            policy: What is to be improved.
+            body: Of the robot.
+            config: Settings.
+            generator: Draws the actions of the E-step.
+            validation: On what the policy is judged.
+            critic: Its critic, if it sees more than the privileged features of the goal task.
+        """
         super().__init__(validation or Validation())
         self.policy, self.config, self._generator = policy, config, generator
-        self.critic = Critic(body)
+        self.critic = critic or Critic(body)
         self.loss = MPOLoss(policy.action_size, config.loss)
         self.target_policy, self.target_critic = deepcopy(policy), deepcopy(self.critic)
         self._average = moving_average(policy, config.average) if config.average else None
@@ -214,12 +227,13 @@ class MPOLearner(ProductLearner[Batch]):
     def _update_policy(self, batch: Batch, draws: _Draws, guard: NaNGuard) -> dict[str, float]:
         target, action, q = draws
         online = self.policy.over_windows(batch, self.config.n_step)
+        driven = batch["driven"][:, self.config.n_step :] if "driven" in batch else torch.ones_like(q[0]).bool()
+        if not driven.any():
+            return {}
         loss, stats = self.loss(
-            (online.mean.flatten(0, 1), online.scale.flatten(0, 1)),
-            (target.mean.flatten(0, 1), target.scale.flatten(0, 1)),
-            action.flatten(1, 2),
-            q.flatten(1),
-        )
+            (online.mean[driven], online.scale[driven]), (target.mean[driven], target.scale[driven]),
+            action[:, driven], q[:, driven],
+        )  # fmt: skip
         norm = guarded_step(loss, [self._policy_adam, self._dual_adam], guard, clip=self.config.clip)
         if norm is not None and self._average is not None:
             self._average.update_parameters(self.policy)

@@ -105,12 +105,12 @@ class Value(nn.Module):
 class Critic(nn.Module):
     """Q of privileged features and actions as the side ahead sees them (the asymmetric critic of paper C.3)."""
 
-    def __init__(self, body: str = "ball", width: int = 128) -> None:
-        """Build the network for a body."""
+    def __init__(self, body: str = "ball", width: int = 128, extra: int = 0) -> None:
+        """Build the network for a body; `extra` features stand behind the privileged ones."""
         super().__init__()
         layout = feature_layout(get_body(body))
-        self.normaliser = Normaliser(layout.size)
-        self.state = nn.Linear(layout.size, width)
+        self.normaliser = Normaliser(layout.size + extra)
+        self.state = nn.Linear(layout.size + extra, width)
         self.action = nn.Linear(layout.actuators.shape[1], width, bias=False)
         self.norm = nn.LayerNorm(width)
         self.hidden = nn.Linear(width, width)

@@ -55,6 +55,8 @@ class MPOSettings:
     """Updates between copies to the target network."""
     q_weight: float = 0.5
     """Weight of the critic's loss."""
+    critic_first: int = 0
+    """Updates in which the critic learns alone and the policy is held; a policy that is good already needs it."""
     seed: int = 0
 
 
@@ -160,6 +162,10 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
         with self._autocast():
             output = self._answers(self.network, batch.state)
         policy_loss, stats = self.mpo(output.policy, before.policy, before.q)
+        if self._updates < config.critic_first:
+            policy_loss = functional.kl_div(
+                output.policy.log_softmax(1), before.policy.log_softmax(1), reduction="batchmean", log_target=True
+            )
         taken = output.q.gather(1, batch.instruction[:, None])[:, 0]
         errors = functional.smooth_l1_loss(taken, target, reduction="none")
         q_loss = (errors * batch.valid).sum() / batch.valid.sum().clamp(min=1)

@@ -1,0 +1,78 @@
+"""Planner and controller as they explore, in the place of those that play: both draw what they say.
+
+Shapes: B robots, M of them with a decision to take, U actuators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from mujoban_controller.controller import Recurrent, VisuomotorController
+from mujoban_core.interfaces import Controller, ControllerInput, Memory, Planner
+from mujoban_planner.planner import LearnedPlanner, check_abstract_state
+
+
+class DrawingPlanner(Planner):
+    """Draws instructions from the policy of a network; it has none of the rules by which a learned planner decides."""
+
+    def __init__(self, network: LearnedPlanner, generator: torch.Generator) -> None:
+        """Draw with `generator`."""
+        self.network, self._generator = network, generator
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return nothing."""
+        return ()
+
+    @torch.no_grad()
+    def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
+        """Return an instruction for each state, [M] from [M, N, N, 4]."""
+        check_abstract_state(abstract_state)
+        chances = functional.softmax(self.network(torch.from_numpy(abstract_state)).policy, 1)
+        return torch.multinomial(chances, 1, generator=self._generator)[:, 0].numpy(), memory
+
+
+class DrawingController(Controller):
+    """Draws torques from the distribution of a network; those of every third robot deviate by `explore` at least."""
+
+    def __init__(self, network: VisuomotorController, generator: torch.Generator, explore: float) -> None:
+        """Draw with `generator`."""
+        self.network, self._generator, self._explore = network, generator, explore
+
+    def initial_memory(self, batch: int) -> Memory:
+        """Return the network's."""
+        return self.network.initial_memory(batch)
+
+    @torch.no_grad()
+    def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
+        """Return torques limited to [-1, 1], [B, U], and the next memory."""
+        output = self.network(*self.network.to_tensors(inputs), memory=Recurrent(*state))
+        mean, scale = output.action.mean[:, 0], output.action.scale[:, 0]
+        scale[::3] = scale[::3].clamp(min=self._explore)
+        noise = torch.randn(mean.shape, generator=self._generator)
+        return (mean + scale * noise).clamp(-1.0, 1.0).numpy(), output.memory
+
+
+def leaves(tree: Any) -> Iterator[Any]:
+    """Yield the arrays and tensors of nested tuples."""
+    if isinstance(tree, tuple):
+        for part in tree:
+            yield from leaves(part)
+    else:
+        yield tree
+
+
+def rebuilt(tree: Any, tensors: Iterator[Tensor]) -> Any:
+    """Return nested tuples like `tree` whose leaves are given as tensors, in the order of `leaves`."""
+    if isinstance(tree, tuple):
+        parts = [rebuilt(part, tensors) for part in tree]
+        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+    # Copies lie in memory as what torch makes does: matrix products round by that.
+    tensor = next(tensors).clone()
+    return tensor.numpy() if isinstance(tree, np.ndarray) else tensor
