@@ -19,9 +19,10 @@ from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.plugins import AGENT
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
-from mujoban_msgs_py.listening import LOG_PERIOD, PublisherWatch, Received, listen
+from mujoban_msgs_py.listening import PublisherWatch, Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.tick_node import live_qos
+from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_sokoban.episodes import Episodes
 
@@ -139,11 +140,11 @@ class MonitorNode(Node):
         message: EpisodeTruth = received.content
         if message.seed not in self._episodes.seeds or message.difficulty != self._episodes.difficulty:
             self.counts[ANOTHER_RUN] += 1
-            self.get_logger().error(
-                f"another run is in this ROS domain: it plays seed {message.seed} at difficulty {message.difficulty}, "
-                "which is none of this run's",
-                throttle_duration_sec=LOG_PERIOD,
-            )
+            if is_due(self, ANOTHER_RUN):
+                self.get_logger().error(
+                    f"another run is in this ROS domain: it plays seed {message.seed} at difficulty "
+                    f"{message.difficulty}, which is none of this run's"
+                )
             return
         if self._end is not None and message.episode == self._end.episode:
             # The episode goes on, so that its end was not the simulator's word.

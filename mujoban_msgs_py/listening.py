@@ -9,21 +9,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from functools import cache
 from typing import Any, Final, NamedTuple
 
-from rclpy.impl.rcutils_logger import RcutilsLogger
-from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from mujoban_msgs_py.decoders import DECODERS, Decode
 from mujoban_msgs_py.raw import Steady, raw_stamp, read
+from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.topics import PUBLISHERS, Topic
 
-LOG_PERIOD: Final = 5.0
-"""Seconds between two reports of bad input on one topic."""
 WATCH_PERIOD: Final = 1.0
 """Seconds between two looks at who publishes."""
 _THOROUGH: Final = 10
@@ -85,15 +81,8 @@ def listen(
 def reject(node: Node, topic: str, reason: object) -> None:
     """Count a message that is dropped and name its topic, at most once per `LOG_PERIOD`."""
     _count(node, REJECTED)
-    text = " ".join(str(reason).split())
-    logger = _logger(f"{node.get_logger().name}.{topic.strip('/').replace('/', '.')}")
-    logger.error(f"rejected a message on {topic}: {text}", throttle_duration_sec=LOG_PERIOD)
-
-
-@cache
-def _logger(name: str) -> RcutilsLogger:
-    """Return a logger of its own for a node and topic: what is throttled is what one logger says."""
-    return get_logger(name)
+    if is_due(node, topic):
+        node.get_logger().error(f"rejected a message on {topic}: {' '.join(str(reason).split())}")
 
 
 def _count(node: Node, kind: str) -> None:

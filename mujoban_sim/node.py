@@ -20,12 +20,13 @@ from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES, FASTEST
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.listening import LOG_PERIOD, Received, listen
+from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.kept import KeptArrays
 from mujoban_msgs_py.runtime.pace import Pace
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
+from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.observation import ObservationPublisher
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
@@ -359,7 +360,8 @@ class SimulatorNode(Node):
 
     def _reject(self, kind: str, reason: str) -> None:
         self.counts[kind] += 1
-        self.get_logger().error(reason, throttle_duration_sec=LOG_PERIOD)
+        if is_due(self, kind):
+            self.get_logger().error(reason)
 
     # Services
 

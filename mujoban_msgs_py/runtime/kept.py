@@ -12,6 +12,8 @@ from rclpy.node import Node
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from mujoban_msgs_py.seldom import is_due
+
 Kept = TypeVar("Kept")
 _LOG_PERIOD: Final = 10.0
 """Seconds between two warnings that nothing can be kept."""
@@ -40,10 +42,8 @@ class KeptArrays:
         except OSError as error:
             for path in (self._partial, self.path):
                 path.unlink(missing_ok=True)
-            node.get_logger().warning(
-                f"{self.path}: {error.strerror}; after a crash this node would start anew",
-                throttle_duration_sec=_LOG_PERIOD,
-            )
+            if is_due(node, "not kept", _LOG_PERIOD):
+                node.get_logger().warning(f"{self.path}: {error.strerror}; after a crash this node would start anew")
 
     def read(self, take: Callable[[dict[str, NDArray[Any]]], Kept]) -> Kept | None:
         """Return what `take` makes of the arrays, or None if there are none yet.

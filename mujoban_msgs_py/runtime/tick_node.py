@@ -30,10 +30,11 @@ from rclpy.task import Future
 from mujoban_core.children import end_with_parent
 from mujoban_core.signals import StopSignal, interruptible
 from mujoban_msgs_py.decoders import checked
-from mujoban_msgs_py.listening import LOG_PERIOD, reject
+from mujoban_msgs_py.listening import reject
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
+from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import EPISODE, Message, Topic
 
@@ -177,16 +178,14 @@ class TickNode(Node):
             self._publish()
         elif stamp == self._handled:
             # It was answered as an end, with nothing: that end was not the simulator's word.
-            self.get_logger().error(
-                f"{EPISODE.name} contradicts itself at {stamp} ns: two simulators?", throttle_duration_sec=LOG_PERIOD
-            )
+            if is_due(self, "contradiction"):
+                self.get_logger().error(f"{EPISODE.name} contradicts itself at {stamp} ns: two simulators?")
             self.counts["contradictory episodes"] += 1
             self._handled = stamp - 1
         elif stamp < self._handled and episode.step == 0:
             # Time has jumped back: another simulator, or a bag that is played from its start.
-            self.get_logger().warning(
-                "simulated time jumped back: starting anew", throttle_duration_sec=LOG_PERIOD
-            )
+            if is_due(self, "jump back"):
+                self.get_logger().warning("simulated time jumped back: starting anew")
             self._handled, self._open = -1, None
         elif self._open is not None and stamp == self._open[0]:
             self._offers += 1

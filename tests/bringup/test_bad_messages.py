@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
+from rclpy.impl import rcutils_logger
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
@@ -13,10 +14,10 @@ from benchmarks.malformed import TARGETS, Vandal
 from bringup.graph_recorder import RecorderNode
 from bringup.monitor import ANOTHER_RUN
 from bringup.viz import VizNode
-from mujoban_msgs_py import conversions, listening, topics
+from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.decoders import DECODERS
-from mujoban_msgs_py.listening import Received
+from mujoban_msgs_py.listening import Received, reject
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import generate_level
 
@@ -147,7 +148,6 @@ def test_an_end_that_the_simulator_did_not_announce_is_taken_back_when_the_tick_
 
 
 def test_messages_that_are_no_messages_are_named_by_topic(play_graph, capfd):
-    listening._logger.cache_clear()  # what a test before this one was told is not held back here
     graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
     publisher = graph.tap.create_publisher(topics.INSTRUCTION.type, topics.INSTRUCTION.name, topics.INSTRUCTION.qos)
     listeners = 5  # simulator, termination, controller, monitor and the test's tap
@@ -190,3 +190,16 @@ def test_a_flood_of_instructions_does_not_wash_away_the_one_that_is_waited_for(p
 
 def test_every_topic_is_attacked():
     assert {topic.name for topic in TARGETS} == {*topics.GRAPH_TOPICS, topics.RECORDED.name}
+
+
+def test_what_is_wrong_again_and_again_is_counted_each_time_and_said_seldom_without_asking_who_calls(
+    play_graph, capfd, monkeypatch
+):
+    node = play_graph(episodes=Episodes(1, 0, difficulty=1)).monitor
+    reject(node, "/nowhere", "one")
+    monkeypatch.setattr(rcutils_logger, "CallerId", lambda: pytest.fail("it looks for its caller on disk"))
+    for _ in range(100):
+        reject(node, "/nowhere", "two")
+    assert node.counts["rejected messages"] == 101
+    (said,) = (line for line in capfd.readouterr().err.splitlines() if "/nowhere" in line)
+    assert said.endswith("a message on /nowhere: one")
