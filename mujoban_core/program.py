@@ -43,6 +43,8 @@ _EXPECTED: Final = {
     errno.EROFS: "a place that can be written to",
 }
 """What a program expects of a file of which the system says that."""
+_OUT_OF_MEMORY: Final = ("allocate memory", "failed to map segment")
+"""How MuJoCo, torch and the system's loader of libraries say that there is no memory left."""
 _SCRIPTS: Final = "mujoban-"
 """Start of the names of the installed commands."""
 
@@ -68,22 +70,30 @@ def exit_status(prog: str, command: Callable[[], int]) -> int:
     try:
         with interruptible():
             return _flushed(command)
-    except (ValueError, OSError, ImportError) as error:
-        if (earlier := interruption(error)) is not None:
-            return interrupt_status(earlier)
-        if isinstance(error, ImportError):
-            raise  # of the installation, not of the input
-        if isinstance(error, BrokenPipeError):
-            # Python flushes once more when it ends.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return _READER_LEFT
-        say(f"{prog}: error: {reason(error)}")
-        return USAGE_ERROR
+    except Exception as error:
+        return _failure(prog, error)
     except KeyboardInterrupt as error:
         say(f"{prog}: interrupted")
         return interrupt_status(error)
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else USAGE_ERROR
+
+
+def _failure(prog: str, error: Exception) -> int:
+    """Say in one line what is wrong with the input or the machine, and return the status; raise what is neither."""
+    if isinstance(error, (ValueError, OSError, ImportError)) and (earlier := interruption(error)) is not None:
+        return interrupt_status(earlier)
+    if isinstance(error, BrokenPipeError):
+        # Python flushes once more when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _READER_LEFT
+    if isinstance(error, MemoryError) or any(sign in str(error) for sign in _OUT_OF_MEMORY):
+        say(f"{prog}: error: out of memory ({reason(error)}), expected more than this process may have")
+    elif isinstance(error, (ValueError, OSError)):
+        say(f"{prog}: error: {reason(error)}")
+    else:
+        raise error
+    return USAGE_ERROR
 
 
 def _flushed(command: Callable[[], int]) -> int:

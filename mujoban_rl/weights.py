@@ -215,7 +215,7 @@ def _build(cls: type[ModuleT], config: Mapping[str, Any], path: Path) -> ModuleT
     """Return a module of a configuration from a record."""
     try:
         return cls(**config)
-    except WeightsError:
+    except (WeightsError, MemoryError):
         raise
     except Exception as error:  # whatever a module makes of numbers that it was never meant for
         reason = " ".join(str(error).split()).partition(" Exception raised from")[0]

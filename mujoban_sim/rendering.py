@@ -21,6 +21,7 @@ from mujoban_core.bodies import FIRST_PERSON_CAMERA, Body
 from mujoban_core.camera import FRAME_SIZE, TOP_DOWN_CAMERA, in_view
 from mujoban_core.grid import GRID_SIZE, cell_to_xy
 from mujoban_core.worker import Worker
+from mujoban_sim import BACKENDS
 from mujoban_sim.appearance import (
     BOX_COLOUR,
     BOX_ON_TARGET_COLOUR,
@@ -66,9 +67,9 @@ def open_context(size: int) -> GLContext:
     """
     backend = os.environ.get("MUJOCO_GL", "").strip().lower() or "egl"
     os.environ.setdefault("LP_NUM_THREADS", "0")
+    if backend not in BACKENDS:
+        raise RenderingError(f"MUJOCO_GL is {backend!r}, expected one of {', '.join(BACKENDS)}, or nothing")
     try:
-        if backend not in ("egl", "osmesa", "glfw"):
-            raise ValueError("expected MUJOCO_GL to be egl, osmesa or glfw")
         context = importlib.import_module(f"mujoco.{backend}").GLContext(size, size)
         context.make_current()
     except Exception as error:

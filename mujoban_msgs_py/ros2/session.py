@@ -16,7 +16,8 @@ from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
+
+from mujoban_msgs_py.runtime.tick_node import init_ros
 
 DISCOVERY_LIMIT: Final = 5.0
 """Seconds within which what exists has been discovered."""
@@ -48,7 +49,7 @@ class Session:
 
     def __enter__(self) -> Self:
         self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        init_ros([], self._context)
         overrides = [Parameter("use_sim_time", value=True)] if self._sim_time else []
         name = f"_ros2cli_{os.getpid()}"
         self.node = rclpy.create_node(

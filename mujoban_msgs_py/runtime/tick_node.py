@@ -8,6 +8,7 @@ neighbour which was restarted in between receives what it has missed.
 from __future__ import annotations
 
 import os
+import re
 import sys
 import time
 from abc import abstractmethod
@@ -18,6 +19,7 @@ from typing import Any, NamedTuple, Unpack
 
 import rclpy
 from mujoban_msgs.msg import Episode
+from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
@@ -234,10 +236,27 @@ def confine_discovery() -> None:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
-def init_ros(args: Sequence[str] | None = None) -> None:
-    """Initialise rclpy for `spin`, which looks after signals itself; discovery stays on this host."""
+def init_ros(args: Sequence[str] | None = None, context: Context | None = None) -> None:
+    """Initialise rclpy for `spin`, which looks after signals itself; discovery stays on this host.
+
+    Args:
+        args: Command line, with ROS arguments.
+        context: What is initialised; None is the default context.
+
+    Raises:
+        OSError: If ROS cannot write its log.
+    """
     confine_discovery()
-    rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)
+    given = None if args is None else list(args)
+    try:
+        rclpy.init(args=given, context=context, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        folder = re.search(r"log directory '(.*?)'", str(error))
+        if folder is None:
+            raise
+        raise OSError(
+            f"ROS cannot write its log to {folder[1]}, expected a folder that can be written to in ROS_LOG_DIR"
+        ) from error
 
 
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -255,6 +256,21 @@ def test_without_opengl_the_commands_say_what_to_install(monkeypatch, capfd):
     monkeypatch.setattr(rendering, "open_context", no_context)
     assert run(run_stack, "--headless", "--difficulty", 1, *ALL_ORACLES) == 2
     assert "error: cannot open an OpenGL context: install the Debian packages libegl1" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "said"),
+    [
+        ("MUJOCO_GL", "bogus", "MUJOCO_GL is 'bogus', expected one of egl, osmesa, glfw, or nothing"),
+        ("ROS_LOG_DIR", "/proc/x", "ROS cannot write its log to /proc/x, expected a folder that can be written to"),
+    ],
+)
+def test_what_is_wrong_with_the_environment_is_one_line(variable, value, said):
+    command = [sys.executable, "bringup/run_stack.py", "--headless", "--difficulty", "1", *ALL_ORACLES]
+    root = Path(run_stack.__file__).parents[1]
+    ended = subprocess.run(command, cwd=root, env={**os.environ, variable: value}, capture_output=True, text=True)
+    (line,) = [line for line in ended.stderr.splitlines() if "another graph runs" not in line]
+    assert ended.returncode == 2 and line.startswith(f"run_stack.py: error: {said}")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -70,3 +70,17 @@ def test_an_option_of_many_subcommands_is_proposed_once():
 
     with pytest.raises(ValueError, match=r"--initail.*expected --initial FLOAT$"):
         read_options({"one": Options, "two": Options}, ["one", "--initail", "1"], "program")
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("Could not allocate memory"), ImportError("x.so: failed to map segment")]
+)
+def test_a_machine_without_memory_is_one_line_and_a_fault_of_ours_a_traceback(capsys, error):
+    def fail(error):
+        raise error
+
+    assert exit_status("program", lambda: fail(error)) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("program: error: out of memory (") and said.count("\n") == 1
+    with pytest.raises(RuntimeError, match="ours"):
+        exit_status("program", lambda: fail(RuntimeError("ours")))
