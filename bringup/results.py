@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mujoban_core.files import write_atomically
-from mujoban_core.plugins import is_privileged
+from mujoban_core.plugins import PRIVILEGED, is_privileged
 from mujoban_core.stats import wilson_interval
 
 
@@ -81,6 +82,8 @@ def report(results: Sequence[EpisodeResult], weights: Mapping[str, str], **extra
     }
 
 
+_DIGITS = 12
+"""Of a digest that a summary shows: enough to tell weights apart, in a terminal of 60 columns."""
 SEEDS_SHOWN = 12
 """Seeds of lost episodes that a summary names for each cause."""
 
@@ -104,9 +107,15 @@ def summary(content: Mapping[str, Any]) -> list[str]:
         more = f" and {count - SEEDS_SHOWN} more" if count > SEEDS_SHOWN else ""
         lines.append(f"lost by {cause}: {count} (seeds {', '.join(seeds[:SEEDS_SHOWN])}{more})")
     if content["privileged"]:
-        told = ", ".join(f"{role}: {content['weights'][role]}" for role in content["privileged"])
+        told = ", ".join(f"{role}: {_brief(content['weights'][role])}" for role in content["privileged"])
         lines.append(f"privileged, told the ground truth: {told}")
     return lines + [f"{event}: {count}" for event, count in sorted(content.get("counts", {}).items())]
+
+
+def _brief(identity: str) -> str:
+    """Return what plays a role for a line of which all are privileged: of a digest the first digits."""
+    name = identity.removesuffix(PRIVILEGED)
+    return f"weights {name[:_DIGITS]}" if re.fullmatch("[0-9a-f]{64}", name) else name
 
 
 def use_of_test_levels(content: Mapping[str, Any], commit: str | None) -> dict[str, Any]:

@@ -308,8 +308,9 @@ def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capf
     report, few = tmp_path / "out.json", ["--difficulty", 1, "--episodes", 1, "--time-limit", 20, "--body", "ant"]
     oracles = ["--oracle", "estimator,termination,planner"]
     assert run(evaluate, *few, *oracles, "--controller", ant_teacher, "--json", report) == 0
-    assert json.loads(report.read_text())["body"] == "ant"
-    capfd.readouterr()
+    content = json.loads(report.read_text())
+    assert content["body"] == "ant"
+    assert f"controller: weights {content['weights']['controller'][:12]}\n" in capfd.readouterr().out
     assert run(evaluate, *few, *oracles) == 2
     error = capfd.readouterr().err
     assert "the controller was trained for the body ball: expected weights for ant" in error
