@@ -123,8 +123,9 @@ class JointActor(Actor):
         said, state = self._stack.step(seen, world.truth(), self._state)
         world.instruct(said.instruction, said.issued)
         features = self._features(state)
-        issued = np.flatnonzero(said.issued)
-        self._log.decided(issued, said.abstract_state[issued], said.instruction[issued])
+        # Looks, and the ways to them, are part of the decision before: the planner did not ask for them.
+        own = np.flatnonzero(state.planner.memory[0] != self._state.planner.memory[0])
+        self._log.decided(own, said.abstract_state[own], said.instruction[own])
         step = task.step(said.torque)
         self._log.rewarded(step.reward)
         self._log.ended(step.terminated, step.truncated)

@@ -20,22 +20,25 @@ from mujoban_planner.planner import LearnedPlanner, check_abstract_state
 
 
 class DrawingPlanner(Planner):
-    """Draws instructions from the policy of a network; it has none of the rules by which a learned planner decides."""
+    """Draws instructions from the policy of a network; it has none of the rules by which a learned planner decides.
+
+    Memory: how often it was asked, int64 [B], so that its own decisions can be told from those of looking around.
+    """
 
     def __init__(self, network: LearnedPlanner, generator: torch.Generator) -> None:
         """Draw with `generator`."""
         self.network, self._generator = network, generator
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return nothing."""
-        return ()
+        """Return zeros."""
+        return (np.zeros(batch, np.int64),)
 
     @torch.no_grad()
     def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
         """Return an instruction for each state, [M] from [M, N, N, 4]."""
         check_abstract_state(abstract_state)
         chances = functional.softmax(self.network(torch.from_numpy(abstract_state)).policy, 1)
-        return torch.multinomial(chances, 1, generator=self._generator)[:, 0].numpy(), memory
+        return torch.multinomial(chances, 1, generator=self._generator)[:, 0].numpy(), (memory[0] + 1,)
 
 
 class DrawingController(Controller):

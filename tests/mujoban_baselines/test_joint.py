@@ -120,19 +120,27 @@ def test_policies_are_held_while_their_critics_learn_and_move_after_that():
     source.close()
 
 
+def decisions_of(actor, sequences):
+    """Return how many decisions are finished in so many sequences of three new ticks each."""
+    return sum(len(actor.act().arrays["decision/reward"]) for _ in range(sequences))
+
+
 def test_turns_on_the_spot_are_nobodys_driving_and_other_torques_are_drawn():
     learner, source = learner_and_source()
     source.close()
     settings = JointSettings(look_around=40, controller=CONTROLLER, planner=SMALL.planner)
-    actor = make_actor(TASK, learner.networks.plans(), StartingWeights(), settings, 0, 0)
+    task = TaskConfig(levels="easy", robots=2, episode_seconds=5.0)
+    actor = make_actor(task, learner.networks.plans(), StartingWeights(), settings, 0, 0)
     actor.set_weights(learner.weights(), 0)
     arrays = actor.act().arrays
     assert (arrays["instruction"] == int(Instruction.STAY)).all() and not arrays["driven"].any(), "the first look"
     assert (arrays["action"] == [0.0, np.float32(0.7)]).all()
+    assert not decisions_of(actor, 10), "looks are not the planner's decisions, though each tick has a new instruction"
     actor.close()
-    actor = make_actor(TASK, learner.networks.plans(), StartingWeights(), SMALL, 0, 0)
+    actor = make_actor(task, learner.networks.plans(), StartingWeights(), SMALL, 0, 0)
     actor.set_weights(learner.weights(), 0)
     arrays = actor.act().arrays
+    assert decisions_of(actor, 25)
     assert arrays["driven"].all() and np.abs(arrays["action"]).max() <= 1.0
     assert len(np.unique(arrays["action"][..., 0])) > 4
     assert arrays["first"][0].all() and not arrays["first"][1:].any()
