@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mujoban_baselines.task import MAX_BOXES, Sights, Task, TaskStep
 from mujoban_core.bodies import BALL
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.grid import GRID_SIZE
+from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
 from mujoban_rl.engine import State
 
 _SKY: Final = 24
@@ -84,9 +84,13 @@ class SquaresTask(Task):
         return frame
 
     def _abstract_state(self) -> NDArray[np.float32]:
-        state = np.zeros((self.batch, GRID_SIZE, GRID_SIZE, 4), np.float32)
-        for channel, name in enumerate(_COLOURS):
-            cell = ((1.0 + self._places[name]) / 2 * GRID_SIZE).astype(np.int64).clip(0, GRID_SIZE - 1)
+        """Return a room in which the walker is the robot, the red square the target and the blue one a box."""
+        state = np.zeros((self.batch, GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32)
+        state[..., WALL] = 1.0
+        state[:, 1:-1, 1:-1, WALL] = 0.0
+        inner = GRID_SIZE - 2
+        for channel, name in ((AGENT, "walker"), (TARGET, "goal"), (BOX, "decoy")):
+            cell = 1 + ((1.0 + self._places[name]) / 2 * inner).astype(np.int64).clip(0, inner - 1)
             state[np.arange(self.batch), cell[:, 1], cell[:, 0], channel] = 1.0
         return state
 
