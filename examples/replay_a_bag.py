@@ -7,10 +7,12 @@ Here its torques are applied again to the level that it names: the world is the 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags.training import episodes, open_training_bag
 from mujoban_sim.world import World
@@ -20,9 +22,11 @@ from mujoban_sokoban.levels import Level
 TOPICS = (topics.TRUE_EPISODE, topics.POSE, topics.TORQUE)
 
 
-def main(path: Path) -> None:
+def main(arguments: Sequence[str]) -> int:
     """Play every episode of a bag again and say how far the robot is from where it was recorded."""
-    for ticks in episodes(open_training_bag(path, TOPICS), TOPICS):
+    if len(arguments) != 1:
+        raise ValueError(f"{len(arguments)} arguments, expected one: the path of a bag")
+    for ticks in episodes(open_training_bag(Path(arguments[0]), TOPICS), TOPICS):
         spec = EpisodeSpec(Level.from_text(ticks[0][0].level), ticks[0][0].seed)
         world = World(1, max_boxes=len(spec.level.boxes))
         world.reset([0], [spec])
@@ -31,7 +35,8 @@ def main(path: Path) -> None:
             apart = max(apart, float(np.abs(world.pose[0] - pose).max()))
             world.step(torque[None])
         print(f"seed {spec.seed}: {len(ticks)} ticks, at most {apart:.1e} apart")
+    return 0
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    sys.exit(exit_status("replay_a_bag.py", lambda: main(sys.argv[1:])))

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from mujoban_core import children
+from mujoban_core.program import say
 from mujoban_core.signals import StopSignal
 from mujoban_core.text import readable
 from mujoban_rl.limits import NaNGuard, TimeLimit
@@ -220,6 +221,9 @@ class Trainer(Generic[BatchT]):
                 if not stop.requested and self._evaluated != self.progress.updates:
                     self._evaluate(log)
                 self.save()
+            if stop.requested:
+                done = f"{readable(self.progress.samples)} samples"
+                say(f"{self.directory.path}: interrupted after {done}; the same command goes on from there")
         finally:
             self.source.close()
         return spent

@@ -200,7 +200,7 @@ def open_bag(path: str | Path, *, damaged: Damage = "refuse") -> Bag:
     """
     path = Path(path)
     if not path.exists():
-        raise BagError(f"no bag at {path}")
+        raise BagError(f"no bag at {path}, expected a folder or a file (.mcap, .db3) of one")
     if not path.is_dir():
         return Bag(path, [_storage(path, damaged)])
     metadata = Metadata.read(path)

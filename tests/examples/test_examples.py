@@ -3,6 +3,7 @@
 import importlib.util
 import runpy
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -24,8 +25,10 @@ def run(monkeypatch, capsys, tmp_path):
 
     def example(name, *arguments):
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
-        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
-        return capsys.readouterr().out
+        with suppress(SystemExit):
+            runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        said = capsys.readouterr()
+        return said.out + said.err
 
     return example
 
@@ -62,6 +65,14 @@ def test_a_bag_is_replayed(run, oracles, tmp_path):
             recorder.write(tick)
     (bag,) = (tmp_path / "bag").iterdir()
     assert f"seed {spec.seed}: {tick.step[0] + 1} ticks, at most 0.0e+00 apart" in run("replay_a_bag.py", bag)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"), [((), "0 arguments, expected one"), (("none",), "no bag at none, expected a folder")]
+)
+def test_a_bag_that_is_missing_is_one_line(run, arguments, said):
+    line = run("replay_a_bag.py", *arguments)
+    assert line.startswith(f"replay_a_bag.py: error: {said}") and line.count("\n") == 1
 
 
 def test_no_example_is_left_out():

@@ -101,12 +101,13 @@ def same(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
 
 
-def test_a_run_interrupted_by_a_signal_and_resumed_equals_one_that_never_stopped(tmp_path):
+def test_a_run_interrupted_by_a_signal_and_resumed_equals_one_that_never_stopped(tmp_path, capsys):
     whole = trainer(tmp_path / "whole")
     assert whole.run()
     kill = Noise(on_batch=lambda n: os.kill(os.getpid(), signal.SIGTERM) if n == 17 else None)
     first = trainer(tmp_path / "parts", kill)
     assert not first.run() and first.progress.updates == 17 and kill.closed
+    assert "parts: interrupted after" in capsys.readouterr().err
     second = trainer(tmp_path / "parts")
     assert second.progress.updates == 17 and second.run()
     assert same(weights(whole), weights(second))
