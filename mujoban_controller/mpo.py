@@ -59,6 +59,9 @@ class MPOTrainingConfig:
     clip: float = 40.0
     critic_first: int = 0
     """Updates in which the critic learns alone, of what was played; a policy that is good already needs it."""
+    initial_scale: float = 0.0
+    """Standard deviation of a camera policy's torques at the start; 0: its own. That of a distilled one is a tenth:
+    within it values hardly differ, and the critic's errors do."""
     explore: float = 0.0
     """Least standard deviation of the torques of every third robot: without it a policy that is sure of itself shows
     the critic nothing else."""

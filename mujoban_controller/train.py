@@ -37,6 +37,7 @@ from mujoban_core.files import digest
 from mujoban_core.program import read_options, run_command
 from mujoban_msgs_py.bags.training import bags_digest, find_bags
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
+from mujoban_rl.networks import set_scale
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import load_weights, provenance
 from mujoban_sim.oracles import OraclePlanner
@@ -162,6 +163,8 @@ class _Parts:
 
     def _asymmetric(self) -> tuple[Learner[Any], Source[Any]]:
         config, policy = self.config, self._camera()
+        if config.asymmetric.initial_scale:
+            set_scale(policy.scale, config.asymmetric.initial_scale)
         learner = MPOLearner(policy, config.task.body, config.asymmetric, self.generator(), self.validation)
 
         def player() -> Player:

@@ -61,6 +61,19 @@ def gaussian(mean: Tensor, raw_scale: Tensor) -> Gaussian:
     return Gaussian(mean, scale + MIN_SCALE)
 
 
+@torch.no_grad()
+def set_scale(layer: nn.Linear, scale: float) -> None:
+    """Let a layer for the scale, of `gaussian_layers`, answer `scale` for all features.
+
+    Raises:
+        ValueError: If the scale is not above `MIN_SCALE`.
+    """
+    if scale <= MIN_SCALE:
+        raise ValueError(f"scale {scale}: expected more than {MIN_SCALE}")
+    nn.init.zeros_(layer.weight)
+    nn.init.constant_(layer.bias, math.log(math.expm1((scale - MIN_SCALE) / INITIAL_SCALE)) - math.log(math.expm1(1.0)))
+
+
 class Normaliser(nn.Module):
     """Scales features to mean 0 and deviation 1 of the samples that `update` has seen."""
 
