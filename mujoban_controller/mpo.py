@@ -50,7 +50,7 @@ class MPOTrainingConfig:
     """Times that each step is learned from, on average."""
     n_step: int = 5
     samples: int = 20
-    """N."""
+    """N, an even number."""
     gamma: float = 0.98
     target_period: int = 100
     """Updates between copies to the target networks."""
@@ -81,6 +81,8 @@ class MPOTrainingConfig:
         """Reject windows that hold no n-step return, or that no sequence holds."""
         if self.sequence < self.window:
             raise ValueError(f"sequence {self.sequence}: expected at least the ticks of a window, {self.window}")
+        if self.samples < 2 or self.samples % 2:
+            raise ValueError(f"samples {self.samples}: expected an even number from 2 on")
         if self.window <= self.n_step:
             raise ValueError(f"window {self.window}: expected more ticks than n_step {self.n_step}")
 
@@ -184,10 +186,14 @@ class MPOLearner(ProductLearner[Batch]):
 
     @torch.no_grad()
     def _draw(self, batch: Batch) -> _Draws:
-        """Return actions of the target policy in the last W - n ticks, with their values."""
+        """Return actions of the target policy in the last W - n ticks, with their values.
+
+        Each lies as far from the mean as another does on its other side: where values are alike, the mean stays.
+        """
         config = self.config
         target = self.target_policy.over_windows(batch, config.n_step)
-        noise = torch.randn((config.samples, *target.mean.shape), generator=self._generator)
+        half = torch.randn((config.samples // 2, *target.mean.shape), generator=self._generator)
+        noise = torch.cat([half, -half])
         action = target.mean + target.scale * noise
         q = self.target_critic(batch["features"][:, config.n_step :], self._as_seen(action, batch))
         return _Draws(target, action, q)

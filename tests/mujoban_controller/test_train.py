@@ -100,7 +100,7 @@ def test_the_best_product_on_validation_levels_is_exported(teacher, tmp_path):
 
 
 def test_a_run_directory_belongs_to_one_configuration(tmp_path):
-    make_trainer(Options(tmp_path, STAGES["ppo"]))
+    make_trainer(Options(tmp_path, STAGES["ppo"], evaluation_episodes=0)).save()
     with pytest.raises(RunError, match="steps"):
         make_trainer(Options(tmp_path, replace(STAGES["ppo"], steps=64)))
 
