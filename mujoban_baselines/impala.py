@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
+from torch.nn import functional
 
 from mujoban_baselines.actor import memory_of
 from mujoban_baselines.networks import RecurrentAgent
@@ -36,6 +37,9 @@ class VTraceTrainingConfig:
     clip: float = 40.0
     auxiliary: float = 0.5
     """Weight of the loss of subgoals (paper D.2)."""
+    beyond: float = 0.05
+    """Weight of the squares by which mean torques are beyond their limits: from where all draws are one to the world
+    no reward leads back."""
     normalised: int = 500
     """Updates after which the normalisation of proprioception stays as it is."""
     loss: VTraceConfig = field(default_factory=VTraceConfig)
@@ -95,6 +99,9 @@ class VTraceLearner(Learner[Arrays]):
         reward = torch.where(ticks["truncated"], value.detach(), ticks["reward"])
         loss, stats = self._loss(log_prob, ticks["log_prob"], entropy, value, reward, over)
         named = {f"vtrace/{name}": float(number) for name, number in stats._asdict().items()}
+        beyond = functional.relu(output.action.mean.abs() - 1.0).square().sum(-1).mean()
+        loss = loss + self.config.beyond * beyond
+        named["vtrace/beyond"] = float(beyond.detach())
         if "pseudo_reward" in ticks:
             pseudo = self.pseudo_value(output.features).squeeze(-1)
             extra, aside = self._loss(

@@ -207,3 +207,14 @@ def test_v_trace_learns_to_walk_to_the_red_square_from_nothing():
         if update == 100:
             source.statistics()
     assert source.statistics()["solved"] > 0.8, "by chance half of the squares that are reached are red"
+
+
+def test_a_mean_beyond_the_limits_is_led_back_where_no_reward_does_so():
+    config = VTraceRunConfig(task=TaskConfig(robots=2), vtrace=VTraceTrainingConfig(unroll=3, rate=3e-3))
+    learner, source = vtrace_parts(config, Informed, ActorOptions(), partial(TellingSquares, batch=2))
+    with torch.no_grad():
+        learner.agent.mean.bias.copy_(torch.tensor([8.0, -8.0]))
+    for update in range(30):
+        source.publish(learner.weights(), update)
+        learner.update(source.next_batch(), 0.0, NaNGuard())
+    assert learner.agent.mean.bias.abs().max() < 7.98, "all draws are one torque to the world"
