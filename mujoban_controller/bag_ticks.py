@@ -189,7 +189,11 @@ class BagTicks(Iterator[Fields]):
         fresh = self._policy.initial_memory(len(found))
         memory = Recurrent(*renew_rows(self._memory, fresh, tick["first"]))
         seen = (torch.from_numpy(tick[name])[:, None] for name in INPUT_FIELDS)
-        self._memory = self._policy(*seen, memory=memory).memory
+        output = self._policy(*seen, memory=memory)
+        self._memory = output.memory
+        if self._teacher is None:
+            # The policy that learns did not play these ticks, but it is the one whose values are asked for.
+            tick |= {"mean": output.action.mean[:, 0].numpy(), "scale": output.action.scale[:, 0].numpy()}
         return tick | {name: m.numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
 
     def state(self) -> State:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_controller.goal_features import feature_layout
-from mujoban_controller.play import Batch
+from mujoban_controller.play import CRITIC, Batch, CriticDraw
 from mujoban_controller.policy import GoalPolicy
 from mujoban_controller.privileged import Critic
 from mujoban_controller.product import ProductLearner, Validation
@@ -53,10 +53,17 @@ class MPOTrainingConfig:
     """N, an even number."""
     gamma: float = 0.98
     target_period: int = 100
-    """Updates between copies to the target networks."""
+    """Updates between copies to the target networks, of each its own."""
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
     clip: float = 40.0
+    critic_updates: int = 0
+    """Updates of a camera policy's critic for each of the policy, from a replay of its own without frames; what comes
+    after its n steps is then valued by the distributions that played. 0: one, from the policy's windows."""
+    critic_windows: int = 256
+    """Windows of n + 1 ticks of such an update."""
+    critic_replay: int = 300_000
+    """Environment steps in its replay."""
     critic_first: int = 0
     """Updates in which the critic learns alone, of what was played; a policy that is good already needs it."""
     initial_scale: float = 0.0
@@ -71,6 +78,14 @@ class MPOTrainingConfig:
     normalised: int = 2_000
     """Updates after which the normalisation of features stays as it is."""
     loss: MPOConfig = field(default_factory=MPOConfig)
+
+    @property
+    def critic_draw(self) -> CriticDraw | None:
+        """What is drawn for the critic alone."""
+        if not self.critic_updates:
+            return None
+        capacity = max(self.critic_replay // self.sequence, 1)
+        return CriticDraw(capacity, self.n_step + 1, self.critic_updates * self.critic_windows)
 
     @property
     def skipped(self) -> int:
@@ -96,6 +111,11 @@ class _Draws(NamedTuple):
     """[N, M, W - n, U]."""
     q: Tensor
     """[N, M, W - n]."""
+
+
+def _beside(batch: Batch) -> Batch:
+    """Return what a batch holds for the critic alone."""
+    return {name.removeprefix(CRITIC): values for name, values in batch.items() if name.startswith(CRITIC)}
 
 
 class MPOLearner(ProductLearner[Batch]):
@@ -133,7 +153,7 @@ class MPOLearner(ProductLearner[Batch]):
         self._policy_adam = torch.optim.Adam(policy.parameters(), config.policy_rate)
         self._critic_adam = torch.optim.Adam(self.critic.parameters(), config.critic_rate)
         self._dual_adam = self.loss.duals.adam(config.loss.dual_learning_rate)
-        self._updates = 0
+        self._updates = self._critic_updates = 0
 
     @property
     def product(self) -> GoalPolicy:
@@ -156,11 +176,12 @@ class MPOLearner(ProductLearner[Batch]):
 
     def own_state(self) -> State:
         """Return the random state and the number of updates, on which the targets' copies depend."""
-        return State({"updates": self._updates}, {"generator": self._generator.get_state()})
+        counts = {"updates": self._updates, "critic_updates": self._critic_updates}
+        return State(counts, {"generator": self._generator.get_state()})
 
     def restore_own(self, state: State) -> None:
         """Take over what `own_state` returned."""
-        self._updates = state.values["updates"]
+        self._updates, self._critic_updates = state.values["updates"], state.values["critic_updates"]
         self._generator.set_state(state.tensors["generator"])
 
     def weights(self) -> Mapping[str, Tensor]:
@@ -169,11 +190,17 @@ class MPOLearner(ProductLearner[Batch]):
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one step of the critic, and one of the policy unless the batch was refused."""
-        config = self.config
+        config, beside = self.config, _beside(batch)
+        # What one of two batches lacks must not keep the other's step from being refused.
+        if beside and not guard.accept(*(values for values in batch.values() if values.is_floating_point())):
+            return {}
         draws = None if self._updates < config.critic_first else self._draw(batch)
-        loss = self._critic_loss(batch, self._value_of_play(batch) if draws is None else draws.q.mean(0))
-        stats = {"loss/critic": float(loss.detach())}
-        accepted = guarded_step(loss, [self._critic_adam], guard, clip=config.clip) is not None
+        if beside:
+            stats, accepted = self._update_critic(beside, guard)
+        else:
+            loss = self._critic_loss(batch, self._value_of_play(batch) if draws is None else draws.q.mean(0))
+            stats = {"loss/critic": float(loss.detach())}
+            accepted = guarded_step(loss, [self._critic_adam], guard, clip=config.clip) is not None
         if accepted and draws is not None:
             stats |= self._update_policy(batch, draws, guard)
         if accepted and self._updates < config.normalised:
@@ -181,20 +208,42 @@ class MPOLearner(ProductLearner[Batch]):
         self._updates += accepted
         if accepted and self._updates % config.target_period == 0:
             self.target_policy.load_state_dict(self.product.state_dict())
-            self.target_critic.load_state_dict(self.critic.state_dict())
+            if not beside:
+                self.target_critic.load_state_dict(self.critic.state_dict())
         return stats
+
+    def _update_critic(self, beside: Batch, guard: NaNGuard) -> tuple[dict[str, float], bool]:
+        """Take the critic's own steps; return whether none was refused."""
+        total, accepted = 0.0, True
+        for first in range(0, len(beside["reward"]), self.config.critic_windows):
+            batch = {name: values[first : first + self.config.critic_windows] for name, values in beside.items()}
+            loss = self._critic_loss(batch, self._value_of_players(batch))
+            total += float(loss.detach())
+            accepted &= guarded_step(loss, [self._critic_adam], guard, clip=self.config.clip) is not None
+            self._critic_updates += 1
+            if self._critic_updates % self.config.target_period == 0:
+                self.target_critic.load_state_dict(self.critic.state_dict())
+        return {"loss/critic": total / self.config.critic_updates}, accepted
+
+    @torch.no_grad()
+    def _value_of_players(self, batch: Batch) -> Tensor:
+        """Return the values, in the last W - n ticks, of the policies that played them, [M, W - n]."""
+        n = self.config.n_step
+        mean, scale = batch["mean"][:, n:], batch["scale"][:, n:]
+        action = mean + scale * self._pairs(mean)
+        return self.target_critic(batch["features"][:, n:], self._as_seen(action, batch)).mean(0)
+
+    def _pairs(self, mean: Tensor) -> Tensor:
+        """Return N draws of noise, [N, ...], each with its opposite: where values are alike, the mean stays."""
+        half = torch.randn((self.config.samples // 2, *mean.shape), generator=self._generator)
+        return torch.cat([half, -half])
 
     @torch.no_grad()
     def _draw(self, batch: Batch) -> _Draws:
-        """Return actions of the target policy in the last W - n ticks, with their values.
-
-        Each lies as far from the mean as another does on its other side: where values are alike, the mean stays.
-        """
+        """Return actions of the target policy in the last W - n ticks, with their values."""
         config = self.config
         target = self.target_policy.over_windows(batch, config.n_step)
-        half = torch.randn((config.samples // 2, *target.mean.shape), generator=self._generator)
-        noise = torch.cat([half, -half])
-        action = target.mean + target.scale * noise
+        action = target.mean + target.scale * self._pairs(target.mean)
         q = self.target_critic(batch["features"][:, config.n_step :], self._as_seen(action, batch))
         return _Draws(target, action, q)
 

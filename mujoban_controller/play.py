@@ -174,7 +174,26 @@ class ExploringPlayer(CameraPlayer):
         task = self.task
         noise = torch.randn(mean.shape, generator=self.generator)
         torque = (mean + torch.maximum(scale, self._least) * noise).clamp(-1.0, 1.0).numpy()
-        return torque, {"features": task.features(), "side": task.side.copy(), "action": task.action_of(torque)}
+        seen = {"features": task.features(), "side": task.side.copy(), "action": task.action_of(torque)}
+        return torque, {**seen, "mean": mean.numpy(), "scale": scale.numpy()}
+
+
+CRITIC_FIELDS = ("features", "side", "action", "reward", "discount", "truncated", "mean", "scale")
+"""What a critic learns from that sees no frames; `mean` and `scale` are of the policy that played."""
+CRITIC = "critic/"
+"""Begins the names of these fields in a batch, in windows of their own."""
+
+
+@dataclass(frozen=True)
+class CriticDraw:
+    """What a critic's batches are drawn from, and how."""
+
+    capacity: int
+    """Sequences in its replay, which has no frames."""
+    window: int
+    """Ticks of its windows."""
+    windows: int
+    """Of all its updates between two of the policy."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +212,8 @@ class Draw:
     """Batches for each tick played."""
     first: int
     """Ticks played before the first batch."""
+    critic: CriticDraw | None = None
+    """What is drawn for a critic beside it."""
 
     @property
     def overlap(self) -> int:
@@ -216,6 +237,7 @@ class ReplaySource(Source[Batch]):
         """
         self._player, self._draw, self._generator, self._recorded = player, draw, generator, recorded
         self._replay = SequenceReplay(draw.capacity, draw.length)
+        self._long = None if draw.critic is None else SequenceReplay(draw.critic.capacity, draw.length)
         self._builder = SequenceBuilder(draw.length, draw.overlap)
         self._due, self._ticks = 0.0, 0
         self._summary = OutcomeSummary()
@@ -232,11 +254,15 @@ class ReplaySource(Source[Batch]):
             self._recorded.take(weights)
 
     def next_batch(self) -> Batch:
-        """Play until a batch is due; return windows, [M, W, ...] each."""
+        """Play until a batch is due; return windows, [M, W, ...] each, and with them those for the critic."""
         while self._due < 1.0 or not self._replay.added:
             self._play()
         self._due -= 1.0
-        return self._replay.sample(self._draw.windows, self._generator, self._draw.window)
+        batch = self._replay.sample(self._draw.windows, self._generator, self._draw.window)
+        if self._long is None or self._draw.critic is None:
+            return batch
+        beside = self._long.sample(self._draw.critic.windows, self._generator, self._draw.critic.window)
+        return batch | {CRITIC + name: values for name, values in beside.items()}
 
     def _play(self) -> None:
         tick, outcomes = self._player.tick()
@@ -248,6 +274,8 @@ class ReplaySource(Source[Batch]):
         sequence = self._builder.add(tick)
         if sequence is not None:
             self._replay.add(sequence)
+            if self._long is not None:
+                self._long.add({name: sequence[name] for name in CRITIC_FIELDS})
         self._ticks += 1
         if self._ticks >= self._draw.first:
             self._due += self._draw.per_tick
@@ -263,6 +291,8 @@ class ReplaySource(Source[Batch]):
         parts = {"player": self._player.state(), "replay": self._replay.state(), "builder": self._builder.state()}
         if self._recorded is not None:
             parts["recorded"] = self._recorded.state()
+        if self._long is not None:
+            parts["long"] = self._long.state()
         return State.of({**parts, "own": own})
 
     def restore(self, state: State) -> None:
@@ -272,6 +302,8 @@ class ReplaySource(Source[Batch]):
             self._recorded.restore(state.part("recorded"))
         self._replay.restore(state.part("replay"))
         self._builder.restore(state.part("builder"))
+        if self._long is not None:
+            self._long.restore(state.part("long"))
         own = state.part("own")
         self._due, self._ticks = own.values["due"], own.values["ticks"]
         self._generator.set_state(own.tensors["generator"])

@@ -213,9 +213,11 @@ class _Parts:
     ) -> ReplaySource:  # fmt: skip
         width = self.config.task.batch + rows
         per_batch = settings.windows * (settings.window - settings.skipped)
+        critic = settings.critic_draw if isinstance(settings, MPOTrainingConfig) else None
         draw = Draw(
             capacity=max(settings.replay // settings.sequence, 1), length=settings.sequence, window=settings.window,
             windows=settings.windows, per_tick=width * settings.reuse / per_batch, first=settings.first // width,
+            critic=critic,
         )  # fmt: skip
         return ReplaySource(player, draw, self.generator(), recorded)
 

@@ -37,6 +37,10 @@ STAGES = {
     "ppo": TrainConfig(stage="teacher", algorithm="ppo", task=TASK, ppo=PPOTrainingConfig(length=8, minibatch=16)),
     "mpo": TrainConfig(stage="teacher", algorithm="mpo", task=TASK, mpo=MPO),
     "asymmetric": TrainConfig(stage="mpo", task=TASK, network=NETWORK, asymmetric=replace(MPO, average=0.9)),
+    "critic beside": TrainConfig(
+        stage="mpo", task=TASK, network=NETWORK,
+        asymmetric=replace(MPO, critic_updates=2, critic_windows=3, critic_replay=64, critic_first=2),
+    ),
     "distil": TrainConfig(stage="distil", teacher=Path("teacher"), task=TASK, network=NETWORK, distil=DISTIL),
 }
 
