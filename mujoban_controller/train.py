@@ -81,8 +81,8 @@ class TrainConfig:
     distil: DistilConfig = field(default_factory=DistilConfig)
     asymmetric: MPOTrainingConfig = field(
         default_factory=lambda: MPOTrainingConfig(
-            window=16, windows=16, sequence=16, replay=64_000, first=6_000, normalised=2_000, critic_first=8_000,
-            explore=0.3, policy_rate=1e-4,
+            window=16, windows=16, sequence=16, replay=64_000, first=6_000, reuse=2.0, normalised=2_000,
+            critic_updates=4, critic_first=1_500, average=0.99, initial_scale=0.25, policy_rate=1e-4,
         )
     )
     """Of the stage mpo."""
@@ -269,7 +269,11 @@ def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
     """Run the command."""
     options = read_options(Options, command_line, prog, __doc__)
     torch.set_num_threads(options.threads)
-    make_trainer(options).run(limit_seconds=options.seconds)
+    trainer = make_trainer(options)
+    if options.config.stage == "mpo" and options.config.initial is not None and trainer.progress.updates == 0:
+        # What the run makes is what has solved most, and that may be what it begins with.
+        trainer.learner.evaluate()
+    trainer.run(limit_seconds=options.seconds)
     return 0
 
 
