@@ -105,11 +105,14 @@ def estimate_is_right(
 def is_unsolvable(state: NDArray[np.bool_]) -> bool:
     """Tell whether the rules prove that an abstract state, [N, N, 4], can no longer be solved.
 
-    States that the rules do not know, such as two boxes that round into one cell, are not proven.
+    States that the rules do not know, such as two boxes that round into one cell, or no wall around, are not proven.
     """
     boxes = np.argwhere(state[..., BOX])
     player = np.argwhere(state[..., AGENT])
     regular = len(boxes) == state[..., TARGET].sum() and len(player) == 1
+    edge = np.ones(state.shape[:2], np.bool_)
+    edge[1:-1, 1:-1] = False
+    regular &= state[edge, WALL].all()
     if not regular or (state[..., WALL] & (state[..., BOX] | state[..., AGENT])).any():
         return False
     row, column = player[0]

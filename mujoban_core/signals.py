@@ -19,6 +19,9 @@ from types import FrameType, TracebackType
 from typing import Final, NoReturn, Self
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_COMPILERS: Final = ("numba", "llvmlite")
+_LATER: Final = 0.05
+"""Seconds after which a signal that was put off comes again."""
 """Ctrl-C, a polite kill, a terminal that was closed."""
 AGAIN: Final = 0.5
 """Seconds after the first signal from which on another SIGINT is a second one; runners that pass on what the terminal
@@ -78,8 +81,9 @@ def leave(status: int) -> NoReturn:
 def interruptible() -> Iterator[None]:
     """Raise `Interrupted` in the main thread where a signal asks the process to end."""
 
-    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
-        raise Interrupted(number)
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if not _put_off(number, frame):
+            raise Interrupted(number)
 
     before = _handle(interrupt)
     try:
@@ -158,7 +162,7 @@ class StopSignal:
     def _handler(self, number: int, frame: FrameType | None) -> None:
         again = self.requested and number == signal.SIGINT and time.monotonic() - self._at > AGAIN
         self._note(number)
-        if (again or not self.deferred) and not self._raised:
+        if (again or not self.deferred) and not self._raised and not _put_off(number, frame):
             self._raised = True
             raise Interrupted(number)
 
@@ -175,6 +179,22 @@ class StopSignal:
         self._before = {}
         if self.number is not None and isinstance(value, OSError) and value.errno == errno.EIO:
             raise Interrupted(self.number) from value
+
+
+def _put_off(number: int, frame: FrameType | None) -> bool:
+    """Tell whether a signal came while functions were being compiled; it will then come again.
+
+    What is raised there is lost in a callback of LLVM, with words on the terminal, or comes out as another error. A
+    first start compiles for some seconds, later ones not at all.
+    """
+    while frame is not None:
+        if frame.f_globals.get("__name__", "").partition(".")[0] in _COMPILERS:
+            later = threading.Timer(_LATER, os.kill, (os.getpid(), number))
+            later.daemon = True
+            later.start()
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _handle(handler: Callable[[int, FrameType | None], None]) -> dict[signal.Signals, _Handler]:

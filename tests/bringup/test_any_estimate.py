@@ -6,10 +6,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bringup.failure import EpisodeLog
+from bringup.failure import EpisodeLog, is_unsolvable
 from bringup.overlay import grid_picture
 from bringup.view import grid_text
-from mujoban_core.grid import AGENT, BOX, Instruction
+from mujoban_core.grid import AGENT, BOX, TARGET, Instruction
 from mujoban_core.interfaces import ControllerInput, GroundTruth
 from mujoban_core.look_around import LookAroundPlanner, step_to_view, turn_view
 from mujoban_planner import load
@@ -56,6 +56,12 @@ def test_planners_decide_on_any_estimates(planners, states):
         for state in states:
             instruction, now = planner.step(state[None], np.array([True]), now)
             assert 0 <= instruction[0] < len(Instruction)
+
+
+def test_nothing_is_proven_of_a_state_without_walls_around_it():
+    state = np.zeros((10, 10, 4), np.bool_)
+    state[5, 5, AGENT] = state[4, 4, BOX] = state[3, 3, TARGET] = True
+    assert not is_unsolvable(state)
 
 
 @any_settings

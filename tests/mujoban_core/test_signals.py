@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -117,3 +118,23 @@ def test_an_interrupted_import_is_an_interruption_and_another_failed_one_is_not(
     interrupted = Interrupted(signal.SIGTERM)
     assert hidden(interrupted) is interrupted
     assert hidden(RuntimeError("no such driver")) is None
+
+
+COMPILER = """
+import os, signal, time
+def compile():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.01)
+    done.append(True)
+"""
+
+
+@pytest.mark.parametrize("context", [interruptible, lambda: StopSignal(deferred=False)])
+def test_a_signal_while_a_function_is_compiled_waits_until_that_is_done(context):
+    done = []
+    inside = {"__name__": "numba.core.dispatcher", "done": done}
+    exec(COMPILER, inside)
+    with pytest.raises(Interrupted), context():
+        inside["compile"]()
+        time.sleep(5.0)
+    assert done == [True]
