@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mujoban_sim.world_kernels import apply_torque
-from mujoban_sokoban.episodes import EpisodeSpec
 
 
 class TorqueError(ValueError):
@@ -27,19 +24,6 @@ def check_rows(rows: ArrayLike, batch: int) -> NDArray[np.int64]:
     if len(set(chosen.tolist())) != len(chosen):
         raise ValueError(f"rows {chosen.tolist()}: expected each once")
     return chosen
-
-
-def check_levels(episodes: Sequence[EpisodeSpec], max_boxes: int) -> None:
-    """Reject levels with too many boxes.
-
-    Raises:
-        ValueError: if there is one.
-    """
-    for level in (episode.level for episode in episodes):
-        if len(level.boxes) > max_boxes:
-            raise ValueError(
-                f"level {level.name!r} has {len(level.boxes)} boxes: expected at most max_boxes = {max_boxes}"
-            )
 
 
 def hand_over_torque(action: NDArray[np.floating], control: NDArray[np.float64]) -> None:

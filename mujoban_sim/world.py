@@ -19,13 +19,13 @@ from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET, WALL, cell_to_xy, xy_to_cell
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_sim.cameras import Cameras
-from mujoban_sim.checks import check_levels, check_rows, hand_over_torque
+from mujoban_sim.checks import check_rows, hand_over_torque
 from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
 from mujoban_sim.presets import DEFAULT_WORLD, get_world
 from mujoban_sim.scene import BOX_COORDINATES, SceneCache, settled_positions
 from mujoban_sim.snapshots import Portable, Snapshot, check_snapshot, decode_episodes, encode_episodes
 from mujoban_sim.world_kernels import KernelState, pack, update
-from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.episodes import EpisodeSpec, check_levels
 
 if TYPE_CHECKING:
     from mujoban_sim.rendering import CameraName

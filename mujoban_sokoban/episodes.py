@@ -151,3 +151,16 @@ class Episodes(LazyEpisodes):
 
     def _make(self, index: int) -> EpisodeSpec:
         return self.source.episode(self.seeds[index])
+
+
+def check_levels(episodes: Sequence[EpisodeSpec], max_boxes: int) -> None:
+    """Reject levels with too many boxes.
+
+    Raises:
+        ValueError: if there is one.
+    """
+    for level in (episode.level for episode in episodes):
+        if len(level.boxes) > max_boxes:
+            raise ValueError(
+                f"level {level.name!r} has {len(level.boxes)} boxes: expected at most max_boxes = {max_boxes}"
+            )
