@@ -17,6 +17,7 @@ from mujoban_core.bodies import FIRST_PERSON_CAMERA
 from mujoban_core.camera import TOP_DOWN_CAMERA
 from mujoban_core.interfaces import GroundTruth, Observation, module_seeds, renew_rows
 from mujoban_core.sense_plan_act import Decision
+from mujoban_core.trees import map_leaves
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 
@@ -72,12 +73,7 @@ class Tick(NamedTuple):
 
 def select(tree: Tree, rows: NDArray[np.int64]) -> Tree:
     """Return the given batch rows of every array in any nesting of tuples and NamedTuples; None stays."""
-    if tree is None:
-        return tree
-    if isinstance(tree, tuple):
-        parts: list[Any] = [select(part, rows) for part in tree]
-        return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)  # pyright: ignore
-    return tree[rows]  # pyright: ignore
+    return map_leaves(lambda leaf: None if leaf is None else leaf[rows], tree)
 
 
 def ticks(

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.grid import INSTRUCTION_LIMIT, Instruction
+from mujoban_core.trees import map_leaves
 
 StateT = TypeVar("StateT")
 
@@ -104,16 +105,14 @@ def renew_rows(state: StateT, fresh: StateT, done: NDArray[np.bool_]) -> StateT:
 
     Works on any nesting of tuples and NamedTuples of arrays or tensors, so on every module's state.
     """
-    return _renewed(state, fresh, np.flatnonzero(done))
+    rows = np.flatnonzero(done)
 
+    def renew(old: Any, new: Any) -> Any:
+        renewed = old.copy() if isinstance(old, np.ndarray) else old.clone()
+        renewed[rows] = new[rows]
+        return renewed
 
-def _renewed(state: Any, fresh: Any, rows: NDArray[np.int64]) -> Any:
-    if isinstance(state, tuple):
-        parts = [_renewed(s, f, rows) for s, f in zip(state, fresh, strict=True)]
-        return type(state)(*parts) if hasattr(state, "_fields") else tuple(parts)
-    renewed = state.copy() if isinstance(state, np.ndarray) else state.clone()
-    renewed[rows] = fresh[rows]
-    return renewed
+    return map_leaves(renew, state, fresh)
 
 
 def counter_uniform(seed: NDArray[np.int64], counter: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from torch import Tensor
 import mujoban_estimator
 from mujoban_baselines.joint.decisions import DecisionLog
 from mujoban_baselines.joint.settings import JointSettings, StartingWeights
-from mujoban_baselines.joint.stack import DrawingController, DrawingPlanner, leaves, rebuilt
+from mujoban_baselines.joint.stack import DrawingController, DrawingPlanner
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_controller.controller import MEMORY_FIELDS, VisuomotorController
 from mujoban_controller.goal_features import privileged_features, side_ahead
@@ -24,6 +24,7 @@ from mujoban_core.grid import CHANNELS, GRID_SIZE, INSTRUCTION_LIMIT, Instructio
 from mujoban_core.interfaces import Observation, renew_rows
 from mujoban_core.look_around import look_around
 from mujoban_core.sense_plan_act import Decision, PolicyState, SensePlanAct
+from mujoban_core.trees import leaves, map_leaves
 from mujoban_planner.networks import ARCHITECTURES
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_rl.actors import Actor, Experience
@@ -178,7 +179,14 @@ class JointActor(Actor):
         self._rng.bit_generator.state = own.values["rng"]
         self._generator.set_state(own.tensors["generator"])
         self._first, self._torque = own.tensors["first"].numpy(), own.tensors["torque"].numpy()
-        self._state = rebuilt(self._state, iter(said[name] for name in sorted(said)))
+        kept = iter(said[name] for name in sorted(said))
+
+        def taken(leaf: Any) -> Any:
+            # Copies lie in memory as what torch makes does: matrix products round by that.
+            tensor = next(kept).clone()
+            return tensor.numpy() if isinstance(leaf, np.ndarray) else tensor
+
+        self._state = map_leaves(taken, self._state)
         for name, part in (("log", self._log), ("task", self._task), ("builder", self._builder)):
             part.restore(state.part(name))
 

@@ -5,16 +5,13 @@ Shapes: B robots, M of them with a decision to take, U actuators.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from torch.nn import functional
 
 from mujoban_controller.controller import Recurrent, VisuomotorController
+from mujoban_controller.play import drawn_torque
 from mujoban_core.interfaces import Controller, ControllerInput, Memory, Planner
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state
 
@@ -57,25 +54,4 @@ class DrawingController(Controller):
         """Return torques limited to [-1, 1], [B, U], and the next memory."""
         output = self.network(*self.network.to_tensors(inputs), memory=Recurrent(*state))
         mean, scale = output.action.mean[:, 0], output.action.scale[:, 0]
-        scale[::3] = scale[::3].clamp(min=self._explore)
-        noise = torch.randn(mean.shape, generator=self._generator)
-        return (mean + scale * noise).clamp(-1.0, 1.0).numpy(), output.memory
-
-
-def leaves(tree: Any) -> Iterator[Any]:
-    """Yield the arrays and tensors of nested tuples."""
-    if isinstance(tree, tuple):
-        for part in tree:
-            yield from leaves(part)
-    else:
-        yield tree
-
-
-def rebuilt(tree: Any, tensors: Iterator[Tensor]) -> Any:
-    """Return nested tuples like `tree` whose leaves are given as tensors, in the order of `leaves`."""
-    if isinstance(tree, tuple):
-        parts = [rebuilt(part, tensors) for part in tree]
-        return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
-    # Copies lie in memory as what torch makes does: matrix products round by that.
-    tensor = next(tensors).clone()
-    return tensor.numpy() if isinstance(tree, np.ndarray) else tensor
+        return drawn_torque(mean, scale, self._explore, self._generator), output.memory

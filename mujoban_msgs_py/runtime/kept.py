@@ -12,6 +12,7 @@ from rclpy.node import Node
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from mujoban_core import trees
 from mujoban_msgs_py.seldom import is_due
 
 Kept = TypeVar("Kept")
@@ -64,11 +65,9 @@ def leaves(state: Any) -> Iterator[NDArray[Any]]:
 
     Arrays of objects, which no file can hold, are left out.
     """
-    if isinstance(state, tuple):
-        for part in state:
-            yield from leaves(part)
-    elif not _is_of_objects(state):
-        yield np.asarray(state.cpu() if hasattr(state, "cpu") else state)
+    for leaf in trees.leaves(state):
+        if not _is_of_objects(leaf):
+            yield np.asarray(leaf.cpu() if hasattr(leaf, "cpu") else leaf)
 
 
 def _is_of_objects(array: Any) -> bool:
@@ -81,13 +80,14 @@ def with_leaves(fresh: Any, kept: Iterator[NDArray[Any]]) -> Any:
     Raises:
         ValueError: If the arrays are not those of such a state.
     """
-    if isinstance(fresh, tuple):
-        parts = [with_leaves(part, kept) for part in fresh]
-        return type(fresh)(*parts) if hasattr(fresh, "_fields") else tuple(parts)
-    if _is_of_objects(fresh):
-        return fresh
-    expected, array = next(leaves(fresh)), next(kept, None)
-    if array is None or array.shape != expected.shape or array.dtype != expected.dtype:
-        found = "none" if array is None else f"{array.dtype} {array.shape}"
-        raise ValueError(f"expected a state with an array of {expected.dtype} {expected.shape}, found {found}")
-    return array if isinstance(fresh, np.ndarray) else fresh.new_tensor(array)
+
+    def taken(leaf: Any) -> Any:
+        if _is_of_objects(leaf):
+            return leaf
+        expected, array = next(leaves(leaf)), next(kept, None)
+        if array is None or array.shape != expected.shape or array.dtype != expected.dtype:
+            found = "none" if array is None else f"{array.dtype} {array.shape}"
+            raise ValueError(f"expected a state with an array of {expected.dtype} {expected.shape}, found {found}")
+        return array if isinstance(leaf, np.ndarray) else leaf.new_tensor(array)
+
+    return trees.map_leaves(taken, fresh)
