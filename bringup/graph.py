@@ -43,15 +43,12 @@ NODES: dict[str, type[GraphNode]] = {
 """The nodes of the graph by name."""
 ALONE: dict[str, type[GraphNode]] = {"simulator": SimulatorNode, AGENT: AgentNode}
 """Those of a graph in which an agent plays alone."""
+_KINDS = NODES | ALONE
 
 RESPAWN_PERIOD = 0.1
 """Seconds between two looks at whether the processes live."""
 RESTART_LIMIT = 20
 """Times that a node is started again before the graph is given up."""
-
-
-def _kind(name: str) -> type[GraphNode]:
-    return {**NODES, **ALONE}[name]
 
 
 class GraphError(ValueError):
@@ -107,7 +104,7 @@ class InProcess:
     def start(self, name: str) -> None:
         """Start a node of the graph."""
         overrides = [Parameter(key, value=value) for key, value in self._parameters[name].items()]
-        self.nodes[name] = _kind(name)(parameter_overrides=overrides, context=self._context)
+        self.nodes[name] = _KINDS[name](parameter_overrides=overrides, context=self._context)
         self.executor.add_node(self.nodes[name])
 
     def stop(self, name: str) -> None:
@@ -198,5 +195,5 @@ class Processes:
         self._folder.remove()
 
     def _start(self, name: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", _kind(name).__module__, "--ros-args"]
+        command = [sys.executable, "-m", _KINDS[name].__module__, "--ros-args"]
         return children.start([*command, "--params-file", str(self._parameter_file)])

@@ -159,7 +159,7 @@ def _planner(options: Options) -> list[Stage]:
 def _senses(options: Options) -> list[Stage]:
     found = []
     bags = [] if options.before is None else [str(options.before / PRODUCTS[name]) for name in ("first", "second")]
-    start = None if options.before is None else options.before / PRODUCTS["estimator"]
+    start = None if options.before is None else (options.before / PRODUCTS["estimator"]).parent
     acting = ("controller_mpo", "planner_views")
     for round_, sense in (("first", ("--oracle", "estimator,termination")), ("second", _modules(options, "first"))):
         recording = f"bags_{round_}"
@@ -171,8 +171,8 @@ def _senses(options: Options) -> list[Stage]:
         command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out), "--threads", str(options.cores)]
         command += ["--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
         if start is not None:
-            command += ["--start", str(start.parent)]
-        start = out / "estimator.safetensors"
+            command += ["--start", str(start)]
+        start = out
         found.append(_trainer(options, name, command, f"{name}/weights", recording, cores=options.cores))
     return found
 

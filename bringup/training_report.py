@@ -24,15 +24,17 @@ _PLACE = Place("python -m bringup.train_all", None, "levels for validation")
 
 def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> Path:
     """Collect weights and model cards in `weights/`, draw the curves, and write `report.md`; return its path."""
+    evaluation = _evaluation(run)
+    scores = [] if evaluation is None else [_score(evaluation)]
     for role, name in weights.items():
         for source in ((run / name), (run / name).with_suffix(".json")):
             target = run / "weights" / f"{role}{source.suffix}"
             target.parent.mkdir(exist_ok=True)
             shutil.copyfile(source, target)
-        text = card(target, f"weights/{role}.safetensors", _PLACE, _scores(run))
+        text = card(target, f"weights/{role}.safetensors", _PLACE, scores)
         write_atomically(target.with_suffix(".md"), text.encode())
     figure = draw_curves(run, [s.name for s in pipeline.stages], run / "curves.png")
-    lines = [*_summary(run, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
+    lines = [*_summary(evaluation, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
     if figure:
         lines += ["", "![Validation scores against CPU seconds](curves.png)"]
     path = run / "report.md"
@@ -76,24 +78,23 @@ def _rates(metrics: Path) -> dict[str, list[tuple[float, float]]]:
     return {k: v for k, v in evaluations(metrics).items() if all(0.0 <= y <= 1.0 for _, y in v)}
 
 
-def _scores(run: Path) -> list[Score]:
-    """Return what the four modules solved together."""
-    evaluation = run / "evaluation.json"
-    if not evaluation.exists():
-        return []
-    report = json.loads(evaluation.read_text())
+def _evaluation(run: Path) -> dict[str, Any] | None:
+    """Return the report of the four modules together, if they have been evaluated."""
+    file = run / "evaluation.json"
+    return json.loads(file.read_text()) if file.exists() else None
+
+
+def _score(report: Mapping[str, Any]) -> Score:
     levels = len(report["episodes"])
-    return [Score("all four modules", "none", levels, report["success_rate"], report["success_interval"])]
+    return Score("all four modules", "none", levels, report["success_rate"], report["success_interval"])
 
 
-def _summary(run: Path, pipeline: Pipeline) -> Iterator[str]:
+def _summary(report: Mapping[str, Any] | None, pipeline: Pipeline) -> Iterator[str]:
     hours = sum(entry.seconds for entry in pipeline.entries.values()) / 3600
     yield "# Weights from nothing"
     yield ""
     yield f"All stages together took {hours:.2f} hours of wall-clock, some of them side by side."
-    evaluation = run / "evaluation.json"
-    if evaluation.exists():
-        report = json.loads(evaluation.read_text())
+    if report is not None:
         low, high = report["success_interval"]
         yield ""
         yield (

@@ -86,7 +86,8 @@ class VideoNode(Node):
         self._said: dict[int, Said] = {}
         self._latest: Said | None = None
         self._patience = 0 if alone else PATIENCE
-        for handle, parts in ((self._on_seen, _SEEN), (self._on_said, _SAID))[: 1 if alone else 2]:
+        said = [] if alone else [(self._on_said, _SAID)]
+        for handle, parts in ((self._on_seen, _SEEN), *said):
             join: Synchroniser[Any] = Synchroniser([topic.name for topic in parts])
             for topic, decode in parts.items():
                 listen(self, topic, self._receiver(join, topic.name, handle), qos=live_qos(256), decode=decode)

@@ -19,10 +19,10 @@ from types import FrameType, TracebackType
 from typing import Final, NoReturn, Self
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, a polite kill, a terminal that was closed."""
 _COMPILERS: Final = ("numba", "llvmlite")
 _LATER: Final = 0.05
 """Seconds after which a signal that was put off comes again."""
-"""Ctrl-C, a polite kill, a terminal that was closed."""
 AGAIN: Final = 0.5
 """Seconds after the first signal from which on another SIGINT is a second one; runners that pass on what the terminal
 has sent already, such as make, deliver one twice."""
