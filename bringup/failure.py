@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bringup.results import EpisodeResult, Failure
 from mujoban_core.grid import AGENT, BOX, OFFSETS_RC, TARGET, WALL
+from mujoban_sokoban.levels import walls_around
 from mujoban_sokoban.rules import abstract_successor
 from mujoban_sokoban.solver import Status, solve
 
@@ -110,14 +111,12 @@ def is_unsolvable(state: NDArray[np.bool_]) -> bool:
     boxes = np.argwhere(state[..., BOX])
     player = np.argwhere(state[..., AGENT])
     regular = len(boxes) == state[..., TARGET].sum() and len(player) == 1
-    edge = np.ones(state.shape[:2], np.bool_)
-    edge[1:-1, 1:-1] = False
-    regular &= state[edge, WALL].all()
-    if not regular or (state[..., WALL] & (state[..., BOX] | state[..., AGENT])).any():
+    wall = state[..., WALL]
+    if not regular or not walls_around(wall) or (wall & (state[..., BOX] | state[..., AGENT])).any():
         return False
     row, column = player[0]
     solution = solve(
-        state[..., WALL], state[..., TARGET], boxes, (int(row), int(column)), max_nodes=PROOF_NODES
+        wall, state[..., TARGET], boxes, (int(row), int(column)), max_nodes=PROOF_NODES
     )
     return solution.status == Status.UNSOLVABLE
 

@@ -158,6 +158,12 @@ def stack_levels(levels: Sequence[Level]) -> LevelBatch:
     )
 
 
+def walls_around(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return whether the edge of each grid, [..., N, N], is wall throughout, [...]."""
+    inner = wall[..., 1:-1, 1:-1]
+    return wall.sum((-2, -1)) - inner.sum((-2, -1)) == 4 * (GRID_SIZE - 1)
+
+
 def read_levels(path: str | PathLike[str]) -> list[Level]:
     """Read every level of a file in the Boxoban format.
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from mujoban_core.grid import GRID_SIZE, Instruction
 from mujoban_sokoban import solver_search
 from mujoban_sokoban.bitboard import squares_of, to_square
-from mujoban_sokoban.levels import Level, LevelBatch, stack_levels
+from mujoban_sokoban.levels import Level, LevelBatch, stack_levels, walls_around
 from mujoban_sokoban.solver_labels import count_moves, label_batch, moves_of, search_batch
 from mujoban_sokoban.solver_search import make_workspace
 
@@ -228,8 +228,7 @@ def _checked(batch: LevelBatch) -> LevelBatch:
             f"wall {batch.wall.shape}, target {batch.target.shape}, boxes {batch.boxes.shape} and player "
             f"{batch.player.shape}: expected [B, {GRID_SIZE}, {GRID_SIZE}] twice, [B, K, 2] and [B, 2]"
         )
-    inner = batch.wall[:, 1:-1, 1:-1]
-    if batch.wall.sum() - inner.sum() != count * (GRID_SIZE**2 - inner[:1].size) and count:
+    if not walls_around(batch.wall).all():
         raise ValueError("open boundary: expected walls all around the edge of the grid")
     present = batch.boxes[..., 0] >= 0
     cells = np.concatenate([batch.boxes[present], batch.player])
