@@ -29,12 +29,11 @@ from mujoban_baselines.joint.learner import joint_parts
 from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
 from mujoban_baselines.task import MujobanTask, TaskConfig
-from mujoban_core.files import digest
 from mujoban_core.program import read_options, run_command
 from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import load_weights, provenance
+from mujoban_rl.weights import load_weights, origin, provenance
 
 PROG = "mujoban_baselines.train"
 Size = Literal["S", "M", "L"]
@@ -205,9 +204,8 @@ class MonolithicMPO(_Command):
 
     def trainer(self) -> Trainer[Any]:
         """Make or resume the run."""
-        parts, start = mpo_parts(self.config, self.actors), self.config.start
-        origin = None if start is None else digest(start)
-        return make_trainer(self.config, parts, self.run, self.cadence(50, 5), "monolithic-mpo", start=origin)
+        parts, start = mpo_parts(self.config, self.actors), origin(self.config.start)
+        return make_trainer(self.config, parts, self.run, self.cadence(50, 5), "monolithic-mpo", start=start)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ Shapes: M windows of a batch, W ticks of a window, n steps of a return, N sample
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -57,18 +58,8 @@ class MPOTrainingConfig:
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
     clip: float = 40.0
-    critic_updates: int = 0
-    """Updates of a camera policy's critic for each of the policy, from a replay of its own without frames; what comes
-    after its n steps is then valued by the distributions that played. 0: one, from the policy's windows."""
-    critic_windows: int = 256
-    """Windows of n + 1 ticks of such an update."""
-    critic_replay: int = 300_000
-    """Environment steps in its replay."""
     critic_first: int = 0
     """Updates in which the critic learns alone, of what was played; a policy that is good already needs it."""
-    initial_scale: float = 0.0
-    """Standard deviation of a camera policy's torques at the start; 0: its own. That of a distilled one is a tenth:
-    within it values hardly differ, and the critic's errors do."""
     explore: float = 0.0
     """Least standard deviation of the torques of every third robot: without it a policy that is sure of itself shows
     the critic nothing else."""
@@ -78,14 +69,6 @@ class MPOTrainingConfig:
     normalised: int = 2_000
     """Updates after which the normalisation of features stays as it is."""
     loss: MPOConfig = field(default_factory=MPOConfig)
-
-    @property
-    def critic_draw(self) -> CriticDraw | None:
-        """What is drawn for the critic alone."""
-        if not self.critic_updates:
-            return None
-        capacity = max(self.critic_replay // self.sequence, 1)
-        return CriticDraw(capacity, self.n_step + 1, self.critic_updates * self.critic_windows)
 
     @property
     def skipped(self) -> int:
@@ -100,6 +83,30 @@ class MPOTrainingConfig:
             raise ValueError(f"samples {self.samples}: expected an even number from 2 on")
         if self.window <= self.n_step:
             raise ValueError(f"window {self.window}: expected more ticks than n_step {self.n_step}")
+
+
+@dataclass(frozen=True)
+class AsymmetricConfig(MPOTrainingConfig):
+    """Settings of MPO of a camera policy, whose critic sees more than it does and no frames."""
+
+    critic_updates: int = 0
+    """Updates of the critic for each of the policy, from a replay of its own; what comes after its n steps is then
+    valued by the distributions that played. 0: one, from the policy's windows."""
+    critic_windows: int = 256
+    """Windows of n + 1 ticks of such an update."""
+    critic_replay: int = 300_000
+    """Environment steps in its replay."""
+    initial_scale: float = 0.0
+    """Standard deviation of the torques at the start; 0: the policy's own. That of a distilled one is a tenth: within
+    it values hardly differ, and the critic's errors do."""
+
+    @property
+    def critic_draw(self) -> CriticDraw | None:
+        """What is drawn for the critic alone."""
+        if not self.critic_updates:
+            return None
+        capacity = max(self.critic_replay // self.sequence, 1)
+        return CriticDraw(capacity, self.n_step + 1, self.critic_updates, self.critic_windows)
 
 
 class _Draws(NamedTuple):
@@ -191,8 +198,9 @@ class MPOLearner(ProductLearner[Batch]):
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one step of the critic, and one of the policy unless the batch was refused."""
         config, beside = self.config, _beside(batch)
-        # What one of two batches lacks must not keep the other's step from being refused.
-        if beside and not guard.accept(*(values for values in batch.values() if values.is_floating_point())):
+        # A number that is not finite in one of two batches refuses both; that they are finite is no accepted step.
+        if beside and not all(bool(torch.isfinite(values).all()) for values in batch.values()):
+            guard.accept(math.nan)
             return {}
         draws = None if self._updates < config.critic_first else self._draw(batch)
         if beside:
@@ -213,17 +221,17 @@ class MPOLearner(ProductLearner[Batch]):
         return stats
 
     def _update_critic(self, beside: Batch, guard: NaNGuard) -> tuple[dict[str, float], bool]:
-        """Take the critic's own steps; return whether none was refused."""
-        total, accepted = 0.0, True
-        for first in range(0, len(beside["reward"]), self.config.critic_windows):
-            batch = {name: values[first : first + self.config.critic_windows] for name, values in beside.items()}
+        """Take the critic's own steps, from windows [K, M, W, ...]; return whether none was refused."""
+        losses, accepted = [], True
+        for k in range(len(beside["reward"])):
+            batch = {name: values[k] for name, values in beside.items()}
             loss = self._critic_loss(batch, self._value_of_players(batch))
-            total += float(loss.detach())
+            losses.append(float(loss.detach()))
             accepted &= guarded_step(loss, [self._critic_adam], guard, clip=self.config.clip) is not None
             self._critic_updates += 1
             if self._critic_updates % self.config.target_period == 0:
                 self.target_critic.load_state_dict(self.critic.state_dict())
-        return {"loss/critic": total / self.config.critic_updates}, accepted
+        return {"loss/critic": sum(losses) / len(losses)}, accepted
 
     @torch.no_grad()
     def _value_of_players(self, batch: Batch) -> Tensor:

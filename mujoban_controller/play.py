@@ -167,15 +167,23 @@ class ExploringPlayer(CameraPlayer):
     ) -> None:
         """Play with a copy of `policy`; the torques of every third robot deviate by `explore` at least."""
         super().__init__(task, policy, generator)
-        third = torch.arange(len(task.torque)) % 3 == 0
-        self._least = torch.where(third, explore, 0.0)[:, None]
+        self._explore = explore
 
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
         task = self.task
-        noise = torch.randn(mean.shape, generator=self.generator)
-        torque = (mean + torch.maximum(scale, self._least) * noise).clamp(-1.0, 1.0).numpy()
+        torque = drawn_torque(mean, scale, self._explore, self.generator)
         seen = {"features": task.features(), "side": task.side.copy(), "action": task.action_of(torque)}
         return torque, {**seen, "mean": mean.numpy(), "scale": scale.numpy()}
+
+
+def drawn_torque(
+    mean: Tensor, scale: Tensor, explore: float, generator: torch.Generator
+) -> NDArray[np.float32]:
+    """Return torques that are drawn, limited to [-1, 1], [B, U]; of every third robot with `explore` at least."""
+    third = torch.arange(len(mean)) % 3 == 0
+    least = torch.where(third, explore, 0.0)[:, None]
+    noise = torch.randn(mean.shape, generator=generator)
+    return (mean + torch.maximum(scale, least) * noise).clamp(-1.0, 1.0).numpy()
 
 
 CRITIC_FIELDS = ("features", "side", "action", "reward", "discount", "truncated", "mean", "scale")
@@ -192,8 +200,10 @@ class CriticDraw:
     """Sequences in its replay, which has no frames."""
     window: int
     """Ticks of its windows."""
+    updates: int
+    """K, between two of the policy."""
     windows: int
-    """Of all its updates between two of the policy."""
+    """M of each."""
 
 
 @dataclass(frozen=True)
@@ -254,15 +264,16 @@ class ReplaySource(Source[Batch]):
             self._recorded.take(weights)
 
     def next_batch(self) -> Batch:
-        """Play until a batch is due; return windows, [M, W, ...] each, and with them those for the critic."""
+        """Play until a batch is due; return windows, [M, W, ...] each, and those for the critic, [K, M, W, ...]."""
         while self._due < 1.0 or not self._replay.added:
             self._play()
         self._due -= 1.0
         batch = self._replay.sample(self._draw.windows, self._generator, self._draw.window)
-        if self._long is None or self._draw.critic is None:
+        critic = self._draw.critic
+        if self._long is None or critic is None:
             return batch
-        beside = self._long.sample(self._draw.critic.windows, self._generator, self._draw.critic.window)
-        return batch | {CRITIC + name: values for name, values in beside.items()}
+        beside = self._long.sample(critic.updates * critic.windows, self._generator, critic.window)
+        return batch | {CRITIC + name: x.unflatten(0, (critic.updates, critic.windows)) for name, x in beside.items()}
 
     def _play(self) -> None:
         tick, outcomes = self._player.tick()

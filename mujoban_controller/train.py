@@ -28,18 +28,17 @@ from mujoban_controller.distil import DistilConfig, DistilLearner, DistilPlayer
 from mujoban_controller.episodes import TrainingEpisodes
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import GoalTask
-from mujoban_controller.mpo import MPOLearner, MPOTrainingConfig
+from mujoban_controller.mpo import AsymmetricConfig, MPOLearner, MPOTrainingConfig
 from mujoban_controller.play import Draw, ExploringPlayer, Player, PrivilegedPlayer, ReplaySource
 from mujoban_controller.ppo import PPOLearner, PPOTrainingConfig, RolloutSource
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.product import Validation
-from mujoban_core.files import digest
 from mujoban_core.program import read_options, run_command
-from mujoban_msgs_py.bags.training import bags_digest, find_bags
+from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.networks import set_scale
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import load_weights, provenance
+from mujoban_rl.weights import load_weights, origin, provenance
 from mujoban_sim.oracles import OraclePlanner
 
 PROG = "mujoban_controller.train"
@@ -79,8 +78,8 @@ class TrainConfig:
     mpo: MPOTrainingConfig = field(default_factory=MPOTrainingConfig)
     """Of the stage teacher."""
     distil: DistilConfig = field(default_factory=DistilConfig)
-    asymmetric: MPOTrainingConfig = field(
-        default_factory=lambda: MPOTrainingConfig(
+    asymmetric: AsymmetricConfig = field(
+        default_factory=lambda: AsymmetricConfig(
             window=16, windows=16, sequence=16, replay=64_000, first=6_000, reuse=2.0, normalised=2_000,
             critic_updates=4, critic_first=1_500, average=0.99, initial_scale=0.25, policy_rate=1e-4,
         )
@@ -213,7 +212,7 @@ class _Parts:
     ) -> ReplaySource:  # fmt: skip
         width = self.config.task.batch + rows
         per_batch = settings.windows * (settings.window - settings.skipped)
-        critic = settings.critic_draw if isinstance(settings, MPOTrainingConfig) else None
+        critic = settings.critic_draw if isinstance(settings, AsymmetricConfig) else None
         draw = Draw(
             capacity=max(settings.replay // settings.sequence, 1), length=settings.sequence, window=settings.window,
             windows=settings.windows, per_tick=width * settings.reuse / per_batch, first=settings.first // width,
@@ -249,17 +248,19 @@ def make_trainer(options: Options) -> Trainer[Any]:
     record = {
         **provenance(),
         "training": directory.config,
-        "teacher": None if config.teacher is None else digest(config.teacher),
-        "initial": None if config.initial is None else digest(config.initial),
+        "teacher": origin(config.teacher),
+        "initial": origin(config.initial),
         "data": f"generated levels of difficulty {config.task.difficulty}, seeds of TRAIN_SEEDS",
         "world": config.task.world,
         "bags": [bag.name for bag in options.bags],
-        "bags_digest": bags_digest(find_bags(options.bags)) if options.bags else None,
+        "bags_digest": bags_digest(options.bags),
     }
     on_policy = config.stage == "teacher" and config.algorithm == "ppo"
     cadence = Cadence(
         log_updates=20 if on_policy else 200, publish_updates=1 if on_policy else 10,
         evaluate_samples=options.evaluate_every, save_seconds=options.save_every,
+        # What such a run makes is what has solved most, and that may be what it begins with.
+        evaluate_first=config.stage == "mpo" and config.initial is not None,
     )  # fmt: skip
     budget = Budget(samples=config.steps, cpu_seconds=config.cpu_seconds)
     return Trainer(directory, learner, source, budget, cadence, record=record)
@@ -269,11 +270,7 @@ def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
     """Run the command."""
     options = read_options(Options, command_line, prog, __doc__)
     torch.set_num_threads(options.threads)
-    trainer = make_trainer(options)
-    if options.config.stage == "mpo" and options.config.initial is not None and trainer.progress.updates == 0:
-        # What the run makes is what has solved most, and that may be what it begins with.
-        trainer.learner.evaluate()
-    trainer.run(limit_seconds=options.seconds)
+    make_trainer(options).run(limit_seconds=options.seconds)
     return 0
 
 

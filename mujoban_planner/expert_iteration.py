@@ -9,14 +9,13 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from mujoban_core.files import digest
 from mujoban_planner.imitation import ImitationLearner, LearnerConfig
 from mujoban_planner.samples import Batch
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import provenance
+from mujoban_rl.weights import origin, provenance
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ def expert_iteration(
         **provenance(),
         "method": "expert-iteration",
         "training": asdict(config),
-        "init": None if config.init is None else digest(config.init),
+        "init": origin(config.init),
         "data": "solutions and verdicts of the planner's own search on generated levels, training seeds; no solver",
     }
     budget = Budget(cpu_seconds=config.cpu_seconds, updates=config.updates)

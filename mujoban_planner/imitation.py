@@ -16,8 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_core.files import digest
-from mujoban_msgs_py.bags.training import bags_digest, find_bags
+from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import start_from
 from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
@@ -29,7 +28,7 @@ from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import provenance, save_weights
+from mujoban_rl.weights import origin, provenance, save_weights
 
 _CLIP = 1.0
 """Largest norm of the gradient."""
@@ -201,9 +200,9 @@ def imitation(
         "method": "imitation",
         "training": training,
         "data": _data(config, bags),
-        "init": None if config.init is None else digest(config.init),
+        "init": origin(config.init),
         "bags": [bag.name for bag in bags],
-        "bags_digest": bags_digest(find_bags(bags)) if bags else None,
+        "bags_digest": bags_digest(bags),
     }
     budget = Budget(samples=config.horizon_samples, seconds=config.horizon_seconds)
     return Trainer(run, learner, source, budget, cadence, record=record)

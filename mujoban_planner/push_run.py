@@ -8,12 +8,11 @@ from typing import Any
 
 import torch
 
-from mujoban_core.files import digest
 from mujoban_planner.growth import start_from
 from mujoban_planner.push_policy import PushPolicy
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Budget
-from mujoban_rl.weights import provenance
+from mujoban_rl.weights import origin, provenance
 
 
 @dataclass(frozen=True)
@@ -52,5 +51,4 @@ def starting_policy(config: PushRunConfig) -> PushPolicy:
 def training_record(method: str, config: PushRunConfig) -> dict[str, Any]:
     """Return what the weights' record says of a run."""
     data = "own play of generated levels, training seeds; no solver"
-    init = None if config.init is None else digest(config.init)
-    return {**provenance(), "method": method, "training": asdict(config), "init": init, "data": data}
+    return {**provenance(), "method": method, "training": asdict(config), "init": origin(config.init), "data": data}

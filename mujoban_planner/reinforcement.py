@@ -19,7 +19,7 @@ from torch import nn
 
 from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
-from mujoban_msgs_py.bags.training import bags_digest, find_bags
+from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch, StepStore
 from mujoban_planner.moves import MoveActor, PlayConfig
@@ -162,7 +162,7 @@ def reinforcement(
         "training": asdict(config),
         "init": origin,
         "data": "bags" if isinstance(source, RecordedMoves) else _PLAYED + (" and bags" if bags else ""),
-        "bags_digest": bags_digest(find_bags(bags)) if bags else None,
+        "bags_digest": bags_digest(bags),
     }
     return Trainer(run, learner, source, Budget(), cadence, record=record)
 

@@ -146,6 +146,8 @@ class Cadence:
     evaluate_seconds: float = math.inf
     """Wall-clock seconds between evaluations."""
     save_seconds: float = 120.0
+    evaluate_first: bool = False
+    """Evaluate also what the run begins with."""
 
 
 class Trainer(Generic[BatchT]):
@@ -233,6 +235,8 @@ class Trainer(Generic[BatchT]):
         cadence, progress, source = self.cadence, self.progress, self.source
         clock, meter = Clock(progress, source.worker_cpu_seconds), Meter()
         saved = evaluated = limits.time.elapsed
+        if cadence.evaluate_first and not progress.updates:
+            self._evaluate(log)
         if not self.complete:
             self._publish(again=True)
         while not self.complete:

@@ -19,7 +19,7 @@ from safetensors.torch import save as dump_tensors
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from mujoban_core.files import write_atomically
+from mujoban_core.files import digest, write_atomically
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
@@ -55,6 +55,11 @@ def provenance() -> dict[str, Any]:
     except OSError:
         commit = ""
     return {"command": " ".join(command), "commit": commit or None, "torch": torch.__version__}
+
+
+def origin(path: str | Path | None) -> str | None:
+    """Return the digest of the weights that a run begins with, for its record; None where it begins from nothing."""
+    return None if path is None else digest(path)
 
 
 def save_weights(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,14 +66,18 @@ def open_training_bag(path: Path, wanted: Sequence[Topic], *, skip_damaged: bool
     return bag
 
 
-def bags_digest(bags: Iterable[Path]) -> str:
-    """Return the SHA-256 of bags, by which the record of weights names them: of their names and checksums."""
+def bags_digest(folders: Sequence[Path]) -> str | None:
+    """Return the SHA-256 by which the record of weights names bags, or folders of them: of their names and checksums.
+
+    Raises:
+        BagError: As `find_bags`; without a folder there is None.
+    """
     total = hashlib.sha256()
-    for bag in bags:
+    for bag in find_bags(folders):
         # It has the checksums of all files; a bag that was cut short has none.
         metadata = bag / FILE_NAME
         total.update(f"{bag.name}\0{digest(metadata if metadata.is_file() else bag)}\0".encode())
-    return total.hexdigest()
+    return total.hexdigest() if folders else None
 
 
 def require_training_seeds(bag: Bag) -> None:

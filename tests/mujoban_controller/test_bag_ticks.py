@@ -19,7 +19,7 @@ from mujoban_controller.distil import DistilConfig
 from mujoban_controller.goal_features import feature_layout, goal_offsets
 from mujoban_controller.goal_settings import GoalTaskConfig, judging_config
 from mujoban_controller.goal_task import GoalTask
-from mujoban_controller.mpo import MPOTrainingConfig
+from mujoban_controller.mpo import AsymmetricConfig
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, make_trainer
@@ -121,7 +121,7 @@ def test_rows_go_on_from_episode_to_episode_and_know_the_policys_memory(recorded
 NETWORK = NetworkConfig(channels=(4, 8, 8), features=16, hidden=8)
 MPO = TrainConfig(
     stage="mpo", steps=64, task=GoalTaskConfig(batch=4, difficulty=2), network=NETWORK,
-    asymmetric=MPOTrainingConfig(window=8, windows=2, sequence=8, replay=128, first=64, reuse=1.0),
+    asymmetric=AsymmetricConfig(window=8, windows=2, sequence=8, replay=128, first=64, reuse=1.0),
 )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
 from mujoban_controller.episodes import TrainingEpisodes
 from mujoban_controller.goal_settings import GoalTaskConfig
-from mujoban_controller.mpo import MPOTrainingConfig
+from mujoban_controller.mpo import AsymmetricConfig, MPOTrainingConfig
 from mujoban_controller.ppo import PPOTrainingConfig
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, make_trainer
@@ -31,15 +31,15 @@ from mujoban_sokoban.generator import TRAIN_SEEDS
 
 TASK = GoalTaskConfig(batch=4, difficulty=1)
 NETWORK = NetworkConfig(channels=(4, 8, 8), features=16, hidden=8)
-MPO = MPOTrainingConfig(window=6, windows=4, sequence=8, replay=64, first=32, reuse=1.0, target_period=2)
+MPO: dict[str, Any] = dict(window=6, windows=4, sequence=8, replay=64, first=32, reuse=1.0, target_period=2)
 DISTIL = DistilConfig(window=4, windows=2, sequence=4, replay=64, first=16, reuse=0.5)
 STAGES = {
     "ppo": TrainConfig(stage="teacher", algorithm="ppo", task=TASK, ppo=PPOTrainingConfig(length=8, minibatch=16)),
-    "mpo": TrainConfig(stage="teacher", algorithm="mpo", task=TASK, mpo=MPO),
-    "asymmetric": TrainConfig(stage="mpo", task=TASK, network=NETWORK, asymmetric=replace(MPO, average=0.9)),
+    "mpo": TrainConfig(stage="teacher", algorithm="mpo", task=TASK, mpo=MPOTrainingConfig(**MPO)),
+    "asymmetric": TrainConfig(stage="mpo", task=TASK, network=NETWORK, asymmetric=AsymmetricConfig(**MPO, average=0.9)),
     "critic beside": TrainConfig(
         stage="mpo", task=TASK, network=NETWORK,
-        asymmetric=replace(MPO, critic_updates=2, critic_windows=3, critic_replay=64, critic_first=2),
+        asymmetric=AsymmetricConfig(**MPO, critic_updates=2, critic_windows=3, critic_replay=64, critic_first=2),
     ),
     "distil": TrainConfig(stage="distil", teacher=Path("teacher"), task=TASK, network=NETWORK, distil=DISTIL),
 }
