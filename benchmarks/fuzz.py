@@ -30,13 +30,13 @@ from std_srvs.srv import SetBool, Trigger
 import mujoban_planner
 from benchmarks.command import run_benchmark
 from benchmarks.malformed import DEPTH, Vandal
+from benchmarks.running import ROOT, megabytes
 from bringup.run_stack import main as play
 from mujoban_msgs_py.bags import open_bag
 from mujoban_rl.weights import record_path
 from mujoban_sokoban.generator import generate_level
 from mujoban_sokoban.levels import read_levels, write_levels
 
-ROOT = Path(__file__).parents[1]
 MODES: dict[str, list[str]] = {"lockstep": [], "real time": ["--realtime", "4"]}
 _CALLS = (
     ("/pause", SetBool, SetBool.Request(data=True)),
@@ -105,7 +105,7 @@ def _attack(child: subprocess.Popen[bytes], options: Options) -> dict[str, Any]:
 
     started = goes_on(START)
     clients = {name: vandal.create_client(kind, name) for name, kind, _ in _CALLS}
-    memory, stalls, hangs, heard, since = [_memory(child.pid)], 0, 0, vandal.heard, time.monotonic()
+    memory, stalls, hangs, heard, since = [megabytes(child.pid)], 0, 0, vandal.heard, time.monotonic()
     while started and child.poll() is None and vandal.sent["/clock"] < options.messages:
         burst = 10
         vandal.act(burst)
@@ -117,7 +117,7 @@ def _attack(child: subprocess.Popen[bytes], options: Options) -> dict[str, Any]:
         if vandal.heard != heard:
             heard, since = vandal.heard, time.monotonic()
         if vandal.sent["/clock"] % 1000 == 0:
-            memory.append(_memory(child.pid))
+            memory.append(megabytes(child.pid))
             for name, _, request in _CALLS:
                 clients[name].call_async(request)
                 spin(0.2)  # services are heard in any order
@@ -131,15 +131,6 @@ def _attack(child: subprocess.Popen[bytes], options: Options) -> dict[str, Any]:
         "messages": sum(vandal.sent.values()), "ticks": vandal.heard, "started": started, "crashed": status is not None,
         "stalls": stalls, "hangs": hangs, "goes_on": survived, "status": child.returncode, "megabytes": memory,
     }  # fmt: skip
-
-
-def _memory(pid: int) -> int:
-    """Return the resident memory of a process in megabytes."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except (OSError, IndexError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE") >> 20
 
 
 def damage(paths: list[Path], read: Callable[[], Any], count: int, rng: np.random.Generator) -> Counter[str]:

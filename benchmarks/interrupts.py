@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import psutil
 
 from benchmarks.command import run_benchmark
-from benchmarks.running import GIVE_UP, Process, Run, cpu_seconds, family
+from benchmarks.running import GIVE_UP, Run, cpu_seconds, family, lives, name_of
 from mujoban_core import children
 from mujoban_core.signals import interruptible
 from mujoban_msgs_py.bags import BagError, open_bag
@@ -98,12 +99,12 @@ def _interrupt(run: Run, number: signal.Signals, at: float, bag: Path) -> Try:
         faults.append("did not end")
         run.process.kill()
         status = run.process.wait()
-    while any(member.lives for member in members) and time.monotonic() < start + LIMIT:
+    while any(map(lives, members)) and time.monotonic() < start + LIMIT:
         time.sleep(0.02)
     seconds = time.monotonic() - start
     if seconds > LIMIT:
         faults.append(f"took {seconds:.1f} s, {at:.1f} CPU seconds after the start: {run.last_words}")
-    faults += [f"left a process: {member.name}" for member in members if member.lives]
+    faults += [f"left a process: {name_of(member)}" for member in members if lives(member)]
     expected = -number if number == signal.SIGKILL else 128 + number
     if status != expected:
         faults.append(f"status {status}: {run.last_words}")
@@ -112,12 +113,12 @@ def _interrupt(run: Run, number: signal.Signals, at: float, bag: Path) -> Try:
         faults += _look_at(bag)
         faults += [f"left {name}" for name in sorted(shared) if Path(name).exists() and not _is_used(name)]
     for member in members:
-        if member.lives:
+        if lives(member):
             os.kill(member.pid, signal.SIGKILL)
     return Try(seconds, status, tuple(faults))
 
 
-def _shared_memory(process: Process) -> set[str]:
+def _shared_memory(process: psutil.Process) -> set[str]:
     """Return the files in shared memory that a process has mapped."""
     try:
         maps = Path(f"/proc/{process.pid}/maps").read_text()
@@ -128,8 +129,7 @@ def _shared_memory(process: Process) -> set[str]:
 
 def _is_used(name: str) -> bool:
     """Tell whether any process has mapped a file in shared memory."""
-    alive = (Process.of(int(entry)) for entry in os.listdir("/proc") if entry.isdecimal())
-    return any(name in _shared_memory(process) for process in alive if process is not None)
+    return any(name in _shared_memory(process) for process in psutil.process_iter())
 
 
 def _look_at(folder: Path) -> list[str]:

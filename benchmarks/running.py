@@ -12,14 +12,15 @@ import subprocess
 import termios
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, Self
+
+import psutil
 
 ROOT: Final = Path(__file__).parents[1]
 GIVE_UP: Final = 60.0
 """Seconds after which a command that does not end is killed."""
-_TICKS: Final = os.sysconf("SC_CLK_TCK")
 _CONTROL: Final = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07]*\x07|.)|\r")
 
 
@@ -92,56 +93,44 @@ class Run:
             os.close(self._ours)
 
 
-@dataclass(frozen=True)
-class Process:
-    """A process, told from a later one of the same number by its start."""
-
-    pid: int
-    start: str
-
-    @classmethod
-    def of(cls, pid: int) -> Process | None:
-        """Return a process that lives, or None."""
-        fields = _stat(pid)
-        return None if not fields or fields[0] == "Z" else cls(pid, fields[19])
-
-    @property
-    def lives(self) -> bool:
-        """Whether it has not ended."""
-        return Process.of(self.pid) == self
-
-    @property
-    def name(self) -> str:
-        """Its command line, shortened."""
-        try:
-            return Path(f"/proc/{self.pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()[-60:]
-        except OSError:
-            return str(self.pid)
-
-
-def _stat(pid: int) -> list[str]:
-    """Return the fields of /proc/PID/stat from the state on; none if there is no such process."""
+def lives(process: psutil.Process) -> bool:
+    """Return whether a process has not ended."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return []
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
-def family(pid: int) -> list[Process]:
-    """Return a process and all that descend from it."""
-    process = Process.of(pid)
-    if process is None:
+def name_of(process: psutil.Process) -> str:
+    """Return the command line of a process, shortened."""
+    try:
+        return " ".join(process.cmdline())[-60:]
+    except psutil.Error:
+        return str(process.pid)
+
+
+def family(pid: int) -> list[psutil.Process]:
+    """Return a process and all that descend from it, of those that live."""
+    try:
+        process = psutil.Process(pid)
+        return [member for member in (process, *process.children(recursive=True)) if lives(member)]
+    except psutil.NoSuchProcess:
         return []
-    found = [process]
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        try:
-            offspring = task.read_text().split()
-        except OSError:
-            continue
-        found += [member for child in offspring for member in family(int(child))]
-    return found
 
 
 def cpu_seconds(pid: int) -> float:
     """Return the CPU time [s] of a process and all that descend from it, of ended ones if they were waited for."""
-    return sum(sum(map(int, _stat(p.pid)[11:15] or ())) for p in family(pid)) / _TICKS
+    total = 0.0
+    for member in family(pid):
+        with suppress(psutil.NoSuchProcess):
+            times = member.cpu_times()
+            total += times.user + times.system + times.children_user + times.children_system
+    return total
+
+
+def megabytes(pid: int) -> int:
+    """Return the resident memory of a process; 0 if it has ended."""
+    try:
+        return psutil.Process(pid).memory_info().rss >> 20
+    except psutil.NoSuchProcess:
+        return 0

@@ -17,23 +17,21 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
-import psutil
 import rclpy
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from benchmarks.command import run_benchmark
+from benchmarks.running import ROOT, family
 from mujoban_core.signals import StopSignal
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.runtime.shared_memory import FOLDER
 from mujoban_msgs_py.runtime.tick_node import live_qos
 
-ROOT: Final = Path(__file__).parents[1]
 MODES: Final[dict[str, list[str]]] = {"lockstep": [], "real time": ["--realtime", "1"]}
 COLUMNS: Final = ("megabytes", "file_descriptors", "threads", "shared_megabytes", "ticks_per_second")
 _START: Final = 600.0
@@ -76,14 +74,14 @@ def slope(hours: NDArray[np.float64], values: NDArray[np.float64], blocks: int) 
     }
 
 
-def _look(process: psutil.Process) -> tuple[float, ...]:
+def _look(pid: int) -> tuple[float, ...]:
     """Return memory in megabytes, descriptors and threads of a process and its children, and shared memory in use."""
-    family = [process, *process.children(recursive=True)]
+    members = family(pid)
     own = [file for file in FOLDER.iterdir() if file.is_file() and file.stat().st_uid == os.getuid()]
     return (
-        sum(p.memory_info().rss for p in family) / 1e6,
-        sum(p.num_fds() for p in family),
-        sum(p.num_threads() for p in family),
+        sum(p.memory_info().rss for p in members) / 1e6,
+        sum(p.num_fds() for p in members),
+        sum(p.num_threads() for p in members),
         sum(file.stat().st_size for file in own) / 1e6,
     )
 
@@ -104,8 +102,7 @@ def watch(options: Options, child: subprocess.Popen[bytes]) -> list[tuple[float,
     """Return, every period until the time is over or a signal comes, the hours that have passed and all `COLUMNS`."""
     node, executor, rows = _Ticks(), SingleThreadedExecutor(), list[tuple[float, ...]]()
     executor.add_node(node)
-    process, began = psutil.Process(child.pid), time.monotonic()
-    start = before = time.monotonic()
+    start = before = began = time.monotonic()
     ticks = 0
     with StopSignal() as stop:
         while not stop.requested and child.poll() is None:
@@ -116,7 +113,7 @@ def watch(options: Options, child: subprocess.Popen[bytes]) -> list[tuple[float,
                     raise TimeoutError(f"no tick within {_START:.0f} s of the start")
                 start = before = now
             elif now - before >= options.period:
-                rows.append(((now - start) / 3600, *_look(process), (node.count - ticks) / (now - before)))
+                rows.append(((now - start) / 3600, *_look(child.pid), (node.count - ticks) / (now - before)))
                 before, ticks = now, node.count
             if now - start >= 3600 * options.hours:
                 break

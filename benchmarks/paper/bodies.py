@@ -11,7 +11,7 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from benchmarks.paper.figures import margins
+from benchmarks.paper.figures import margins, save_rates
 from benchmarks.paper.runs import ROOT, SENSE, Run, load
 from mujoban_core.bodies import ANT, BALL
 from mujoban_core.grid import DIFFICULTIES
@@ -56,9 +56,5 @@ def draw(file: Path) -> bool:
             x = [run.difficulty for run, _ in measured]
             axes.errorbar(x, rates, yerr=bars, capsize=3, marker="o", color=colour, label=_TITLES[body])
         axes.scatter([max(DIFFICULTIES)], [_PAPER[body]], marker="x", color=colour, label=f"{body}, paper", zorder=3)
-    axes.set(xlabel="difficulty", ylabel="success rate", ylim=(0, 1.02), xticks=range(1, 6))
-    title = "bars: 95 % intervals (Wilson)"
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", title=title, title_fontsize="small")
-    figure.savefig(file, dpi=120)
-    plt.close(figure)
+    save_rates(figure, axes, file)
     return True

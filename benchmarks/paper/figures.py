@@ -12,6 +12,8 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from benchmarks.paper import runs as sources
 from benchmarks.paper.baselines import BASELINES, points_of
@@ -51,12 +53,17 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
     paper = [(run.difficulty, run.paper_success) for run, _ in reports if run.paper_success is not None]
     if paper:
         axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, Table 1", zorder=3)
+    save_rates(figure, axes, file)
+    return True
+
+
+def save_rates(figure: Figure, axes: Axes, file: Path) -> None:
+    """Name the axes and bars of success against difficulty, write the figure and close it."""
     axes.set(xlabel="difficulty", ylabel="success rate", ylim=(0, 1.02), xticks=range(1, 6))
     title = "bars: 95 % intervals (Wilson)"
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", title=title, title_fontsize="small")
     figure.savefig(file, dpi=120)
     plt.close(figure)
-    return True
 
 
 def baseline_curves(file: Path) -> bool:
