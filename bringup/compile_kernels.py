@@ -1,0 +1,44 @@
+"""Compile what numba compiles, so that neither the first run nor the first training waits: `make setup` does it.
+
+What has been compiled stays in the cache until its file changes.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from bringup.command import Stack
+from bringup.evaluate import evaluate
+from mujoban_planner.lesson_source import LessonActor, LessonConfig
+from mujoban_planner.push_env import PushEnvironment
+from mujoban_planner.samples import Samples, make_batch
+from mujoban_planner.search_lessons import SearchActor, SearchConfig
+from mujoban_planner.validation import NetworkConfig
+from mujoban_rl.actors import Experience
+from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import VALIDATION_SEEDS
+
+_NETWORK = NetworkConfig(channels=4, blocks=1)
+
+
+def _learn_from(experience: Experience, kind: str) -> None:
+    samples = Samples(*(experience.arrays[f"{kind}.{name}"] for name in Samples._fields))
+    make_batch(samples, np.zeros(len(samples.agent), np.int64))
+    environment = PushEnvironment(1)
+    rows = np.arange(1)
+    environment.reset_to(rows, samples.take(rows).boards)
+    environment.step(environment.possible().argmax(1))
+
+
+def main() -> int:
+    """Play a little, and make and read the planner's lessons and search for some."""
+    _learn_from(LessonActor(LessonConfig(levels=4), _NETWORK, 0).act(), "demonstrations")
+    SearchActor(_NETWORK, SearchConfig(trees=8, expansions=8, steps=40), 0).act()
+    evaluate(Stack().policy(), Episodes(2, VALIDATION_SEEDS.start), time_limit=20)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
