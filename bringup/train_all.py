@@ -41,6 +41,7 @@ PRODUCTS: Final = {
     "second": "bags_second",
 }
 """And all that another stage needs: the teacher, its student, the planner of boards in full view, the bags."""
+_BAGS: Final = ("first", "second")
 SHARES: Final = {
     "teacher": 0.05,
     "controller_distil": 0.23,
@@ -83,7 +84,8 @@ class Options:
     hours: float = 8.0
     """Time that the whole run may take on two cores; the budgets of all stages scale with it."""
     before: Annotated[Path | None, tyro.conf.arg(name="continue")] = None
-    """Directory of a finished run: every module goes on from its weights, and learns also from its bags."""
+    """Directory of a finished run: every module goes on from its weights, and learns also from its bags, if they are
+    still there."""
     world: str = DEFAULT_WORLD
     """Physical world: reference or eased."""
     seed: int = 0
@@ -95,7 +97,8 @@ class Options:
         """Reject times in which nothing can be learned."""
         if not self.hours > 0:
             raise ValueError(f"--hours {self.hours}: expected a positive number")
-        missing = [] if self.before is None else [p for p in PRODUCTS.values() if not (self.before / p).exists()]
+        needed = (path for name, path in PRODUCTS.items() if name not in _BAGS)
+        missing = [] if self.before is None else [path for path in needed if not (self.before / path).exists()]
         if missing:
             raise ValueError(f"--continue {self.before}: lacks {missing[0]}, expected the directory of a finished run")
 
@@ -158,7 +161,8 @@ def _planner(options: Options) -> list[Stage]:
 
 def _senses(options: Options) -> list[Stage]:
     found = []
-    bags = [] if options.before is None else [str(options.before / PRODUCTS[name]) for name in ("first", "second")]
+    earlier = [] if options.before is None else [options.before / PRODUCTS[name] for name in _BAGS]
+    bags = [str(folder) for folder in earlier if folder.exists()]
     start = None if options.before is None else (options.before / PRODUCTS["estimator"]).parent
     acting = ("controller_mpo", "planner_views")
     for round_, sense in (("first", ("--oracle", "estimator,termination")), ("second", _modules(options, "first"))):

@@ -49,6 +49,14 @@ def test_a_continued_run_takes_every_module_from_the_one_before(tmp_path: Path) 
     assert str(before / PRODUCTS["first"]) in first and str(before / PRODUCTS["second"]) in found["estimator_second"]
 
 
+def test_a_run_whose_bags_are_gone_is_continued_with_new_ones_alone(tmp_path: Path) -> None:
+    before, run = finished(tmp_path / "before"), tmp_path / "run"
+    for name in ("first", "second"):
+        (before / PRODUCTS[name]).unlink()
+    first = commands(Options(run=run, before=before))["estimator_first"]
+    assert first[first.index("--bags") + 1 : first.index("--out")] == (str(run / PRODUCTS["first"]),)
+
+
 def test_continuing_what_is_not_finished_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"--continue .* lacks .*, expected the directory of a finished run"):
         Options(run=tmp_path / "run", before=tmp_path)
