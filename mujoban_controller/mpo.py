@@ -8,7 +8,6 @@ Shapes: M windows of a batch, W ticks of a window, n steps of a return, N sample
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -198,9 +197,8 @@ class MPOLearner(ProductLearner[Batch]):
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one step of the critic, and one of the policy unless the batch was refused."""
         config, beside = self.config, _beside(batch)
-        # A number that is not finite in one of two batches refuses both; that they are finite is no accepted step.
-        if beside and not all(bool(torch.isfinite(values).all()) for values in batch.values()):
-            guard.accept(math.nan)
+        # A number that is not finite in one of two batches refuses both.
+        if beside and not guard.accept(*batch.values(), part="batch"):
             return {}
         draws = None if self._updates < config.critic_first else self._draw(batch)
         if beside:
@@ -208,7 +206,7 @@ class MPOLearner(ProductLearner[Batch]):
         else:
             loss = self._critic_loss(batch, self._value_of_play(batch) if draws is None else draws.q.mean(0))
             stats = {"loss/critic": float(loss.detach())}
-            accepted = guarded_step(loss, [self._critic_adam], guard, clip=config.clip) is not None
+            accepted = self._step_critic(loss, guard)
         if accepted and draws is not None:
             stats |= self._update_policy(batch, draws, guard)
         if accepted and self._updates < config.normalised:
@@ -227,11 +225,14 @@ class MPOLearner(ProductLearner[Batch]):
             batch = {name: values[k] for name, values in beside.items()}
             loss = self._critic_loss(batch, self._value_of_players(batch))
             losses.append(float(loss.detach()))
-            accepted &= guarded_step(loss, [self._critic_adam], guard, clip=self.config.clip) is not None
+            accepted &= self._step_critic(loss, guard)
             self._critic_updates += 1
             if self._critic_updates % self.config.target_period == 0:
                 self.target_critic.load_state_dict(self.critic.state_dict())
         return {"loss/critic": sum(losses) / len(losses)}, accepted
+
+    def _step_critic(self, loss: Tensor, guard: NaNGuard) -> bool:
+        return guarded_step(loss, [self._critic_adam], guard, clip=self.config.clip, part="critic") is not None
 
     @torch.no_grad()
     def _value_of_players(self, batch: Batch) -> Tensor:
@@ -300,7 +301,7 @@ class MPOLearner(ProductLearner[Batch]):
             (online.mean[driven], online.scale[driven]), (target.mean[driven], target.scale[driven]),
             action[:, driven], q[:, driven],
         )  # fmt: skip
-        norm = guarded_step(loss, [self._policy_adam, self._dual_adam], guard, clip=self.config.clip)
+        norm = guarded_step(loss, [self._policy_adam, self._dual_adam], guard, clip=self.config.clip, part="policy")
         if norm is not None and self._average is not None:
             self._average.update_parameters(self.policy)
         named = scalars(stats._asdict())

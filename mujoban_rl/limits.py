@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 
 import torch
 from torch import Tensor
@@ -17,10 +18,14 @@ class NaNGuard:
         self.patience = patience
         self.skipped = 0
         """Steps refused so far."""
-        self._in_a_row = 0
+        self._in_a_row: Counter[str] = Counter()
 
-    def accept(self, *values: Tensor | float) -> bool:
+    def accept(self, *values: Tensor | float, part: str = "") -> bool:
         """Return whether all values (losses, gradient norm) are finite; if not, the step must be skipped.
+
+        Args:
+            values: Anything that a number which is not finite would show in.
+            part: Which of an update's steps, where there are several: what is in a row is counted for each.
 
         Raises:
             FloatingPointError: After `patience` refusals in a row.
@@ -28,10 +33,10 @@ class NaNGuard:
         finite = all(
             bool(torch.isfinite(v).all()) if isinstance(v, Tensor) else math.isfinite(v) for v in values
         )
-        self._in_a_row = 0 if finite else self._in_a_row + 1
+        self._in_a_row[part] = 0 if finite else self._in_a_row[part] + 1
         self.skipped += not finite
-        if self._in_a_row > self.patience:
-            raise FloatingPointError(f"training diverged: {self._in_a_row} non-finite steps in a row")
+        if self._in_a_row[part] > self.patience:
+            raise FloatingPointError(f"training diverged: {self._in_a_row[part]} non-finite steps in a row")
         return finite
 
 

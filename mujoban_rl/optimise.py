@@ -25,6 +25,7 @@ def guarded_step(
     *,
     clip: float = math.inf,
     clipped: Iterable[nn.Parameter] | None = None,
+    part: str = "",
 ) -> Tensor | None:
     """Step all optimisers along the gradient of a loss, or none of them if a number is not finite.
 
@@ -34,6 +35,7 @@ def guarded_step(
         guard: Decides.
         clip: Largest norm of the gradient of `clipped`.
         clipped: Parameters that are clipped together; those of the first optimiser by default.
+        part: Which step of an update, where it has several; see `NaNGuard.accept`.
 
     Returns:
         The gradient's norm before clipping, or None where the step was refused.
@@ -45,7 +47,7 @@ def guarded_step(
     known = {id(p) for p in first}
     others = [p.grad for p in _parameters(optimisers) if id(p) not in known and p.grad is not None]
     norm = nn.utils.clip_grad_norm_(first, clip)
-    if not guard.accept(loss.detach(), norm, *others):
+    if not guard.accept(loss.detach(), norm, *others, part=part):
         return None
     for optimiser in optimisers:
         optimiser.step()

@@ -1,5 +1,6 @@
 import errno
 import json
+import math
 
 import pytest
 import torch
@@ -158,6 +159,15 @@ def test_weights_round_trip_and_name_what_is_wrong(tmp_path):
         load_weights(Net, path)
     with pytest.raises(WeightsError, match="no such weights file"):
         load_weights(Net, tmp_path / "none.safetensors")
+
+
+def test_a_step_that_is_never_finite_ends_training_though_another_of_each_update_is():
+    guard = NaNGuard(patience=2)
+    for _ in range(2):
+        assert guard.accept(1.0, part="critic") and not guard.accept(math.nan, part="policy")
+    assert guard.accept(1.0, part="critic")
+    with pytest.raises(FloatingPointError, match="3 non-finite steps in a row"):
+        guard.accept(math.nan, part="policy")
 
 
 def test_nan_guard_refuses_and_gives_up():
