@@ -25,6 +25,8 @@ class Critic(nn.Module):
 
     sees: tuple[str, ...] = ()
     """What it reads of the task beside what the agent sees."""
+    teaches_torso = False
+    """Whether it rests on the agent's torso, which then learns from its loss alone."""
 
     @property
     def sense(self) -> BodySense | None:
@@ -56,6 +58,8 @@ class Critic(nn.Module):
 
 class SymmetricCritic(Critic):
     """Sees what the agent sees: a head on its torso."""
+
+    teaches_torso = True
 
     def __init__(self, body: str, features: int, width: int = _WIDTH) -> None:
         """Attach to a torso of F = `features`."""

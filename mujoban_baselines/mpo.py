@@ -163,8 +163,13 @@ class MPOLearner(Learner[Batch]):
             q = self.target_critic(self.target_critic.state(batch, target.features), action)
         online = self._over(self.agent, batch, warm)
         critic_loss = self._critic_loss(batch, online, q.mean(0))
+        policy = online.action
+        if self.critic.teaches_torso:
+            # Each change that the critic makes to the torso would be one of the policy, and the bounds on these stop
+            # it; so the policy learns on the features that the target has, as in Acme's agents from pixels.
+            policy = self.agent.distribution(target.features[:, warm:])
         policy_loss, stats = self.loss(
-            _flat(online.action), _flat(x[:, warm:] for x in target.action),
+            _flat(policy), _flat(x[:, warm:] for x in target.action),
             action[:, :, warm:].flatten(1, 2), q[:, :, warm:].flatten(1),
         )  # fmt: skip
         loss = critic_loss + policy_loss if self._updates >= config.critic_first else critic_loss

@@ -174,7 +174,11 @@ class RecurrentAgent(nn.Module, Agent):
             h, c = self.lstm(embedded[:, i], (h, c))
             outputs.append(h)
         features = self.trunk(torch.cat([torch.stack(outputs, 1), embedded], -1))
-        return AgentOutput(gaussian(self.mean(features), self.scale(features)), features, Recurrent(h, c))
+        return AgentOutput(self.distribution(features), features, Recurrent(h, c))
+
+    def distribution(self, features: Tensor) -> Gaussian:
+        """Return the distribution over torques, mean and scale [..., U], that rests on features [..., F]."""
+        return gaussian(self.mean(features), self.scale(features))
 
     def initial_memory(self, batch: int) -> Memory:
         """Return zeros, a `Recurrent`."""

@@ -171,6 +171,19 @@ def test_symmetric_critics_teach_the_torso_and_asymmetric_ones_do_not():
     assert moved == {"symmetric": True, "asymmetric": False}
 
 
+@pytest.mark.parametrize("critic", ["symmetric", "asymmetric"])
+def test_the_policy_moves_a_torso_of_its_own_alone(critic, monkeypatch):
+    learner, source = mpo_parts(MPORunConfig(critic=critic, mpo=SMALL), ActorOptions(), partial(SquaresTask, batch=4))
+    source.publish(learner.weights(), 0)
+    still = next(learner.critic.parameters()).sum() * 0.0
+    monkeypatch.setattr(learner, "_critic_loss", lambda *batch: still)
+    before = {name: values.clone() for name, values in learner.agent.named_parameters()}
+    learner.update(source.next_batch(), 0.0, NaNGuard())
+    moved = {name for name, values in learner.agent.named_parameters() if not torch.equal(values, before[name])}
+    head = {name for name in before if name.startswith(("mean.", "scale."))}
+    assert moved & head and (moved <= head) == (critic == "symmetric")
+
+
 class TellingSquares(SquaresTask):
     """Says where the squares are, so that little is to be learned from frames."""
 
