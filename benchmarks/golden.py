@@ -55,16 +55,17 @@ _ROBOTS: Final = 16
 _UNROLL: Final = VTraceTrainingConfig(unroll=10, rate=5e-4, gamma=0.9)
 
 
-def _mpo(critic: Any) -> Parts:
-    return mpo_parts(MPORunConfig(critic=critic, mpo=_QUICK), ActorOptions(), partial(SquaresTask, batch=_ROBOTS))
+def _mpo(critic: Any, seed: int) -> Parts:
+    config = MPORunConfig(seed=seed, critic=critic, mpo=_QUICK)
+    return mpo_parts(config, ActorOptions(), partial(SquaresTask, batch=_ROBOTS))
 
 
-def _vtrace(kind: type[TopDownAgent]) -> Parts:
-    config = VTraceRunConfig(task=TaskConfig(robots=_ROBOTS), vtrace=_UNROLL)
+def _vtrace(kind: type[TopDownAgent], seed: int) -> Parts:
+    config = VTraceRunConfig(seed=seed, task=TaskConfig(robots=_ROBOTS), vtrace=_UNROLL)
     return vtrace_parts(config, kind, ActorOptions(), partial(SquaresTask, batch=_ROBOTS))
 
 
-AGENTS: Final[dict[str, Callable[[], Parts]]] = {
+AGENTS: Final[dict[str, Callable[[int], Parts]]] = {
     "mpo-asymmetric": partial(_mpo, "asymmetric"),
     "mpo-symmetric": partial(_mpo, "symmetric"),
     "vtrace-monolithic": partial(_vtrace, TopDownAgent),
@@ -79,11 +80,12 @@ class Options:
     agents: tuple[str, ...] = tuple(AGENTS)
     cpu_minutes: float = 20.0
     """Of one core, for each agent."""
+    seed: int = 0
 
 
-def learn(name: str, cpu_seconds: float) -> dict[str, Any]:
+def learn(name: str, cpu_seconds: float, seed: int) -> dict[str, Any]:
     """Train an agent until it has solved the task or has spent its time; return what it took."""
-    (learner, source), guard = AGENTS[name](), NaNGuard()
+    (learner, source), guard = AGENTS[name](seed), NaNGuard()
     source.publish(learner.weights(), 0)
     start, curve = time.process_time(), [(0, 0.0)]
     while time.process_time() - start < cpu_seconds:
@@ -110,7 +112,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     unknown = set(options.agents) - AGENTS.keys()
     if unknown:
         raise ValueError(f"--agents {min(unknown)}: expected some of {', '.join(AGENTS)}")
-    report = {name: learn(name, 60.0 * options.cpu_minutes) for name in options.agents}
+    report = {name: learn(name, 60.0 * options.cpu_minutes, options.seed) for name in options.agents}
     print(json.dumps(report, indent=2))
     return int(any(outcome["solved"] < SOLVED for outcome in report.values()))
 
