@@ -193,6 +193,7 @@ class SimulatorNode(Node):
         self._started = time.perf_counter()
         if self._resumed:
             self._offer()
+            self._proceed()  # past an episode's last tick, which nobody answers
         else:
             self._begin(self._place.index)
         self._pace.start(self._started)

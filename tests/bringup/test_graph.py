@@ -69,6 +69,19 @@ def test_a_simulator_that_is_killed_goes_on_at_the_same_tick_as_if_nothing_had_h
     assert [e.episode for e in graph.said.episodes.values()] == [e.episode for e in undisturbed.said.episodes.values()]
 
 
+def test_a_simulator_that_is_killed_at_an_episodes_last_tick_begins_the_next_one(play_graph, tmp_path):
+    graph = play_graph(episodes=Episodes(2, 0, difficulty=1), time_limit=6, resume_file=str(tmp_path / "moment"))
+    graph.spin_until(lambda: graph.simulator.ticks >= 2)
+    assert graph.call(SetBool, "/pause", SetBool.Request(data=True)).success
+    while not graph.simulator.world.done[0]:
+        ticks = graph.simulator.ticks
+        assert graph.call(Trigger, "/step", Trigger.Request()).success
+        graph.spin_until(lambda ticks=ticks: graph.simulator.ticks > ticks)
+    graph.graph.stop("simulator")
+    graph.graph.start("simulator")
+    assert [result.seed for result in graph.finish()] == [0, 1]
+
+
 def test_modules_that_are_killed_go_on_from_what_they_remember_as_if_nothing_had_happened(
     play_graph, fresh_weights, tmp_path
 ):
