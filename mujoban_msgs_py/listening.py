@@ -133,10 +133,11 @@ class PublisherWatch:
             f"{info.node_namespace.rstrip('/')}/{info.node_name}"
             for info in self._node.get_publishers_info_by_topic(topic)
         )
-        if names[own] <= 1 + self.ghosts(self._publishers[topic]):
+        ghosts = self.ghosts(self._publishers[topic])
+        if names[own] <= 1 + ghosts:
             del names[own]
-        # Who has only just come, or is going, is not known by name for a moment.
-        self._nameless[topic] = self._nameless[topic] + 1 if names[_NAMELESS] else 0
+        # Who has only just come, or is going, is not known by name for a moment; who was killed may lose it for longer.
+        self._nameless[topic] = self._nameless[topic] + 1 if names[_NAMELESS] > ghosts else 0
         if self._nameless[topic] <= _PATIENCE:
             del names[_NAMELESS]
         return set(names)

@@ -82,6 +82,10 @@ def test_who_has_no_name_yet_is_given_time_to_say_it(play_graph, monkeypatch):
     graph = play_graph(names=[])
     nobody = SimpleNamespace(node_namespace="_NODE_NAMESPACE_UNKNOWN_", node_name="_NODE_NAME_UNKNOWN_")
     monkeypatch.setattr(graph.monitor, "get_publishers_info_by_topic", lambda topic: [nobody])
+    graph.monitor.watch.ghosts = lambda name: 1  # killed not long ago
+    for _ in range(9):
+        graph.monitor.watch.look()
+    graph.monitor.watch.ghosts = lambda name: 0
     graph.monitor.watch.look()
     assert not graph.monitor.watch.seen
     graph.spin_until(lambda: graph.monitor.watch.seen)
