@@ -24,7 +24,7 @@ from mujoban_rl.actors import ReplayStore
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
-from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
+from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss, check_samples, paired_noise
 from mujoban_rl.losses.returns import Returns, windowed_returns
 from mujoban_rl.optimise import guarded_step
 from mujoban_rl.replay import SequenceReplay
@@ -69,7 +69,8 @@ class MPOTrainingConfig:
     """Wider bounds than Acme's, and copies sooner: updates are few here."""
 
     def __post_init__(self) -> None:
-        """Reject windows in which nothing is learned."""
+        """Reject windows in which nothing is learned, and an odd number of samples."""
+        check_samples(self.samples)
         if self.window <= self.overlap:
             raise ValueError(
                 f"window {self.window}: expected more ticks than warm_up {self.warm_up} and n_step {self.n_step} have"
@@ -157,7 +158,7 @@ class MPOLearner(Learner[Batch]):
         config, warm = self.config, self.config.warm_up
         with torch.no_grad():
             target = self._over(self.target_agent, batch, 0)
-            noise = torch.randn((config.samples, *target.action.mean.shape), generator=self._generator)
+            noise = paired_noise(config.samples, target.action.mean, self._generator)
             # Shapes [N, M, W, U] and [N, M, W].
             action = target.action.mean + target.action.scale * noise
             q = self.target_critic(self.target_critic.state(batch, target.features), action)

@@ -26,7 +26,7 @@ from mujoban_core.bodies import get_body
 from mujoban_rl.engine import Scalars, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
-from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
+from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss, check_samples, paired_noise
 from mujoban_rl.losses.returns import td_target
 from mujoban_rl.networks import Gaussian
 from mujoban_rl.optimise import guarded_step, moving_average
@@ -78,8 +78,7 @@ class MPOTrainingConfig:
         """Reject windows that hold no n-step return, or that no sequence holds."""
         if self.sequence < self.window:
             raise ValueError(f"sequence {self.sequence}: expected at least the ticks of a window, {self.window}")
-        if self.samples < 2 or self.samples % 2:
-            raise ValueError(f"samples {self.samples}: expected an even number from 2 on")
+        check_samples(self.samples)
         if self.window <= self.n_step:
             raise ValueError(f"window {self.window}: expected more ticks than n_step {self.n_step}")
 
@@ -239,20 +238,15 @@ class MPOLearner(ProductLearner[Batch]):
         """Return the values, in the last W - n ticks, of the policies that played them, [M, W - n]."""
         n = self.config.n_step
         mean, scale = batch["mean"][:, n:], batch["scale"][:, n:]
-        action = mean + scale * self._pairs(mean)
+        action = mean + scale * paired_noise(self.config.samples, mean, self._generator)
         return self.target_critic(batch["features"][:, n:], self._as_seen(action, batch)).mean(0)
-
-    def _pairs(self, mean: Tensor) -> Tensor:
-        """Return N draws of noise, [N, ...], each with its opposite: where values are alike, the mean stays."""
-        half = torch.randn((self.config.samples // 2, *mean.shape), generator=self._generator)
-        return torch.cat([half, -half])
 
     @torch.no_grad()
     def _draw(self, batch: Batch) -> _Draws:
         """Return actions of the target policy in the last W - n ticks, with their values."""
         config = self.config
         target = self.target_policy.over_windows(batch, config.n_step)
-        action = target.mean + target.scale * self._pairs(target.mean)
+        action = target.mean + target.scale * paired_noise(config.samples, target.mean, self._generator)
         q = self.target_critic(batch["features"][:, config.n_step :], self._as_seen(action, batch))
         return _Draws(target, action, q)
 

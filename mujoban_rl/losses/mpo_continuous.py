@@ -61,6 +61,22 @@ class MPOStats(NamedTuple):
     q: Tensor
 
 
+def check_samples(samples: int) -> None:
+    """Reject a number of sampled actions that makes no pairs.
+
+    Raises:
+        ValueError: If it is odd.
+    """
+    if samples < 2 or samples % 2:
+        raise ValueError(f"samples {samples}: expected an even number from 2 on")
+
+
+def paired_noise(samples: int, like: Tensor, generator: torch.Generator) -> Tensor:
+    """Return N = `samples` draws of noise, each with its opposite, [N, ...]: where values are alike the mean stays."""
+    half = torch.randn((samples // 2, *like.shape), generator=generator)
+    return torch.cat([half, -half])
+
+
 def action_cost(action: Tensor) -> Tensor:
     """Return minus the distance of actions [N, B, D] from the box [-1, 1]^D, [N, B]."""
     return -(action - action.clamp(-1.0, 1.0)).norm(dim=-1)
