@@ -184,10 +184,10 @@ class SimulatorNode(Node):
     def _start_when_complete(self) -> None:
         """Begin once the modules listen and answer, and the recorder as well if one is awaited."""
         recorded = self._settings["await_recorder"]
-        instructions = [topics.INSTRUCTION] if self._settings["instructed"] else []
-        needed = (topics.TORQUE, *instructions, *([topics.RECORDED] if recorded else []))
+        needed = (topics.TORQUE, *[topics.INSTRUCTION] * self._settings["instructed"], *[topics.RECORDED] * recorded)
         answering = all(self.count_publishers(topic.name) for topic in needed)
-        if not (answering and self._observation.matched(everything=recorded)):
+        ended = self._resumed and self._ended  # that end has to be heard; nobody asks for it again
+        if not (answering and self._observation.matched(everything=recorded, ends=ended)):
             return
         self._start_timer.cancel()
         self._started = time.perf_counter()

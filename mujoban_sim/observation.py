@@ -37,9 +37,9 @@ class ObservationPublisher:
         self._on_demand = {*topics.TRUTH_TOPICS, topics.TOP_CAMERA, topics.CAMERA_INFO} - {topics.TRUE_EPISODE}
         self._top_readers, self._top_period = 0, 1
 
-    def matched(self, *, everything: bool) -> bool:
-        """Tell whether somebody subscribes to what the modules need, or to everything."""
-        needed = self._publishers if everything else _NEEDED
+    def matched(self, *, everything: bool, ends: bool = False) -> bool:
+        """Tell whether somebody hears what the modules need, with `ends` how episodes end, or everything."""
+        needed = self._publishers if everything else (*_NEEDED, *[topics.TRUE_EPISODE] * ends)
         return all(self._publishers[topic].get_subscription_count() for topic in needed)
 
     def publish(self, label: TickLabel) -> None:
