@@ -20,7 +20,7 @@ from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import GRID_SIZE
 from mujoban_core.interfaces import Memory
-from mujoban_rl.networks import Gaussian, Normaliser, gaussian, gaussian_layers
+from mujoban_rl.networks import Gaussian, Normaliser, encode_frames, gaussian, gaussian_layers
 
 Sights = Mapping[str, NDArray[Any]]
 """What an agent sees and its networks read, by name, [B, ...] each."""
@@ -123,7 +123,7 @@ class RecurrentAgent(nn.Module, Agent):
         super().__init__()
         self.config: dict[str, Any] = {"body": body}
         self.mixed_precision = False
-        """Whether convolutions compute in bfloat16: training does, the robot does not, so that runs repeat exactly."""
+        """Whether convolutions may compute in bfloat16: in training, not on the robot, so that runs repeat exactly."""
         layout = get_body(body)
         self.proprio_size, self.action_size = layout.proprio_size, layout.action_size
         self.hidden, self.width = hidden, trunk[-1]
@@ -147,11 +147,7 @@ class RecurrentAgent(nn.Module, Agent):
 
     def encode(self, encoder: nn.Module, frame: Tensor) -> Tensor:
         """Return the features [M, F] that a ResNet finds in frames uint8 [M, rows, columns, 3]."""
-        # A permuted NHWC tensor is channels_last already.
-        x = frame.permute(0, 3, 1, 2).to(self.mean.weight.dtype) / 255.0 - 0.5
-        with torch.autocast(frame.device.type, torch.bfloat16, enabled=self.mixed_precision):
-            features = encoder(x)
-        return features.to(x.dtype)
+        return encode_frames(encoder, frame, self.mean.weight.dtype, mixed_precision=self.mixed_precision)
 
     def forward(
         self, sights: Mapping[str, Tensor], memory: Recurrent, first: Tensor | None = None

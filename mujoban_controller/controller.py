@@ -30,7 +30,7 @@ from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
-from mujoban_rl.networks import Gaussian, frame_encoder, gaussian, gaussian_layers, rows_of_sky
+from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder, gaussian, gaussian_layers, rows_of_sky
 
 INPUT_FIELDS = ("frame", "proprio", "instruction", "terminated")
 """What the controller sees, as recorded windows name it."""
@@ -130,7 +130,7 @@ class VisuomotorController(GoalPolicy, Controller):
         self.config = {"body": body, "channels": list(channels), "features": features, "hidden": hidden}
         self.body = body
         self.mixed_precision = False
-        """Whether the ResNet computes in bfloat16: training does, the robot does not, so that runs repeat exactly."""
+        """Whether the ResNet may compute in bfloat16: in training, not on the robot, so that runs repeat exactly."""
         self.joints = len(layout.joints)
         self.proprio_size, self.action_size, self.hidden = layout.proprio_size, layout.action_size, hidden
         # Joint positions are replaced by two sine-cosine pairs; A is one-hot, beta one bit.
@@ -169,11 +169,8 @@ class VisuomotorController(GoalPolicy, Controller):
 
     def encode(self, frame: Tensor) -> Tensor:
         """Return the ResNet's features [M, F] of frames uint8 [M, 64, 64, 3]."""
-        # A permuted NHWC tensor is channels_last already.
-        x = frame[:, self.first_row :].permute(0, 3, 1, 2).to(self.mean.weight.dtype) / 255.0 - 0.5
-        with torch.autocast(frame.device.type, torch.bfloat16, enabled=self.mixed_precision):
-            features = self.encoder(x)
-        return features.to(x.dtype)
+        seen, dtype = frame[:, self.first_row :], self.mean.weight.dtype
+        return encode_frames(self.encoder, seen, dtype, mixed_precision=self.mixed_precision)
 
     def reckon(self, proprio: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
         """Return the track after one more tick, [B, 7], from o_pr [B, P], beta [B] and the track before, [B, 7]."""

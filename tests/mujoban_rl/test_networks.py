@@ -1,11 +1,11 @@
-"""Distributions over torques that the world limits."""
+"""Distributions over torques that the world limits, and the precision in which frames are encoded."""
 
 import math
 
 import pytest
 import torch
 
-from mujoban_rl.networks import Gaussian
+from mujoban_rl.networks import Gaussian, encode_frames
 
 
 def test_torques_beyond_a_limit_have_the_probability_of_the_tail():
@@ -29,3 +29,16 @@ def test_what_the_world_does_not_see_teaches_a_mean_beyond_a_limit_nothing():
     (gains * policy.limited_log_prob(drawn)).sum().backward()
     assert mean.grad is not None and scale.grad is not None
     assert mean.grad.abs().max() < 1e-6 and scale.grad.abs().max() < 1e-6
+
+
+@pytest.mark.parametrize(("capability", "precision"), [("avx512_bf16", torch.bfloat16), ("avx2", torch.float32)])
+def test_frames_are_encoded_in_bfloat16_only_where_the_processor_has_instructions_for_it(
+    monkeypatch, capability, precision
+):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {capability: True}, raising=False)
+    computed = []
+    encoder = torch.nn.Conv2d(3, 2, 3)
+    encoder.register_forward_hook(lambda module, inputs, output: computed.append(output.dtype))
+    frame = torch.zeros(1, 8, 8, 3, dtype=torch.uint8)
+    features = encode_frames(encoder, frame, torch.float32, mixed_precision=True)
+    assert computed == [precision] and features.dtype == torch.float32
