@@ -10,7 +10,6 @@ from typing import Any, Final, NamedTuple, Unpack
 import numpy as np
 from mujoban_msgs.msg import EpisodeTruth
 from numpy.typing import NDArray
-from rclpy.node import Node
 from rclpy.task import Future
 
 from bringup.failure import EpisodeLog
@@ -21,6 +20,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import PublisherWatch, Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
+from mujoban_msgs_py.runtime.ending_node import EndingNode
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
@@ -73,7 +73,7 @@ class Watched(NamedTuple):
         return self.values[topics.TRUE_ABSTRACT_STATE.name]
 
 
-class MonitorNode(Node):
+class MonitorNode(EndingNode):
     """Turns the graph's messages into outcomes of episodes, as `bringup.rollout` does with its ticks.
 
     Attributes:

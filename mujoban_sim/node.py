@@ -11,7 +11,6 @@ from typing import Any, Final, Unpack
 import numpy as np
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
@@ -23,6 +22,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
+from mujoban_msgs_py.runtime.ending_node import EndingNode
 from mujoban_msgs_py.runtime.kept import KeptArrays
 from mujoban_msgs_py.runtime.pace import Pace
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
@@ -67,7 +67,7 @@ PARAMETERS: Final[dict[str, tuple[Any, ParameterDescriptor]]] = {
 """Parameters of the simulator: their defaults, and what `ros2 param describe` says of them."""
 
 
-class SimulatorNode(Node):
+class SimulatorNode(EndingNode):
     """Plays episodes, in lockstep with the graph or in real time.
 
     In lockstep the world steps when the torque and the instruction of the current stamp have arrived, so a run
@@ -130,7 +130,6 @@ class SimulatorNode(Node):
         self._recorded = False
         self._paused = False
         self._steps_due = 0
-        self._destroyed = False
         self._started: float | None = None
         path = self._settings["resume_file"]
         self._kept = KeptArrays(Path(path)) if path else None
@@ -142,14 +141,9 @@ class SimulatorNode(Node):
         report_on(self, self._condition)
         self._start_timer = self.create_timer(MATCH_PERIOD, self._start_when_complete)
 
-    def destroy_node(self) -> None:
-        """End the node; what an executor still has in its queue for it is left alone."""
-        self._destroyed = True
-        super().destroy_node()
-
     @property
     def _over(self) -> bool:
-        return self._destroyed or self.finished.done()
+        return self.ended or self.finished.done()
 
     @property
     def _stamp(self) -> int:

@@ -36,6 +36,7 @@ from mujoban_msgs_py.listening import reject
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
+from mujoban_msgs_py.runtime.ending_node import EndingNode
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import EPISODE, Message, Topic
@@ -63,7 +64,7 @@ class Output(NamedTuple):
     """Bytes are one that is serialised already."""
 
 
-class TickNode(Node):
+class TickNode(EndingNode):
     """A node that answers each tick of the simulator."""
 
     def __init__(self, name: str, **options: Unpack[NodeOptions]) -> None:
@@ -78,12 +79,6 @@ class TickNode(Node):
         self._offers = 0
         self._answered = 0
         self._reported = (0, time.monotonic())
-        self._destroyed = False
-
-    def destroy_node(self) -> None:
-        """End the node; what an executor still has in its queue for it is left alone."""
-        self._destroyed = True
-        super().destroy_node()
 
     @property
     def dropped(self) -> Counter[str]:
@@ -140,7 +135,7 @@ class TickNode(Node):
 
     def retry(self) -> None:
         """Ask `answer` again about the tick that it could not answer yet."""
-        if self._open is None or self._destroyed:
+        if self._open is None or self.ended:
             return
         stamp, inputs = self._open
         episode = inputs[EPISODE.name]
@@ -153,7 +148,7 @@ class TickNode(Node):
         self._publish()
 
     def _receive(self, topic: Topic, decode: Callable[[Any], Any] | None, message: bytes) -> None:
-        if self._destroyed:
+        if self.ended:
             return
         try:
             stamp = raw_stamp(message)
