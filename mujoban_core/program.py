@@ -81,7 +81,7 @@ def exit_status(prog: str, command: Callable[[], int]) -> int:
 
 def _failure(prog: str, error: Exception) -> int:
     """Say in one line what is wrong with the input or the machine, and return the status; raise what is neither."""
-    if isinstance(error, (ValueError, OSError, ImportError)) and (earlier := interruption(error)) is not None:
+    if (earlier := interruption(error)) is not None:
         return interrupt_status(earlier)
     if isinstance(error, BrokenPipeError):
         # Python flushes once more when it ends.

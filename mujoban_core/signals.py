@@ -50,19 +50,14 @@ def interrupt_status(error: KeyboardInterrupt) -> int:
 def interruption(error: BaseException) -> KeyboardInterrupt | None:
     """Return the interruption that an error hides, if there is one.
 
-    Writing to the terminal fails after one where the terminal was closed, and an extension module that is interrupted
-    while it is imported says in its place that it cannot be initialised.
+    Writing to the terminal fails after one where the terminal was closed, an extension module that is interrupted
+    while it is imported says in its place that it cannot be initialised, and a class that a call of `__set_name__`
+    failed.
     """
     earlier = error.__context__
-    while earlier is not None and (isinstance(error, ImportError) or _is_of_closed_terminal(error)):
-        if isinstance(earlier, KeyboardInterrupt):
-            return earlier
+    while earlier is not None and not isinstance(earlier, KeyboardInterrupt):
         earlier = earlier.__context__
-    return None
-
-
-def _is_of_closed_terminal(error: BaseException) -> bool:
-    return isinstance(error, OSError) and error.errno == errno.EIO
+    return earlier
 
 
 def leave(status: int) -> NoReturn:

@@ -10,6 +10,7 @@ import time
 
 import pytest
 
+from mujoban_core.program import exit_status
 from mujoban_core.signals import STOP_SIGNALS, Interrupted, StopSignal, interruptible, interruption
 
 
@@ -118,6 +119,21 @@ def test_an_interrupted_import_is_an_interruption_and_another_failed_one_is_not(
     interrupted = Interrupted(signal.SIGTERM)
     assert hidden(interrupted) is interrupted
     assert hidden(RuntimeError("no such driver")) is None
+
+
+def test_a_class_that_is_interrupted_while_it_is_made_is_an_interruption():
+    class Name:
+        def __set_name__(self, owner, name):
+            raise Interrupted(signal.SIGINT)
+
+    def imported():
+        try:
+            type("Late", (), {"name": Name()})
+        except Exception as error:  # Python 3.11 wraps it in a RuntimeError
+            raise ValueError(f"weights: {error}") from error
+        return 0
+
+    assert exit_status("program", imported) == 130
 
 
 COMPILER = """
