@@ -221,7 +221,7 @@ def test_plays_every_message_to_a_node_that_listens(ros, bag):
     node.create_subscription(topics.POSE.type, "/replayed", heard.append, topics.POSE.qos)
     node.create_subscription(topics.CLOCK.type, topics.CLOCK.name, clock.append, topics.CLOCK.qos)
     process = start(
-        "bag", "play", str(bag), "-r", "4", "-d", "3", "--clock", "--topics", "/pose", "-m", "/pose:=/replayed"
+        "bag", "play", str(bag), "-r", "4", "-d", "1.5", "--clock", "--topics", "/pose", "-m", "/pose:=/replayed"
     )
     while process.poll() is None:
         ros.spin_once(node, timeout_sec=0.05)
