@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 
 TICK: Final = round(CONTROL_PERIOD * 1e9)
 """Nanoseconds of simulated time between two ticks."""
-QUEUE_DEPTH: Final = 64
-"""Messages kept for a slow reader: 3 s at 20 Hz. In lockstep a node is never more than a few ticks behind."""
+QUEUE_DEPTH: Final = 256
+"""Messages kept for a reader that is slow or not known yet: 13 s at 20 Hz. In lockstep a node of the graph is never
+more than a few ticks behind; who only watches may be."""
 LATCHED_DEPTH: Final = 8
 """Messages that a late joiner of a latched topic receives at most; the last one is the latest."""
 

@@ -25,6 +25,7 @@ from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.ending_node import EndingNode
 from mujoban_msgs_py.runtime.kept import KeptArrays
 from mujoban_msgs_py.runtime.pace import Pace
+from mujoban_msgs_py.runtime.reunion import Reunion, Watchers, may_speak
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.topics import TICK
@@ -133,7 +134,8 @@ class SimulatorNode(EndingNode):
         self._started: float | None = None
         path = self._settings["resume_file"]
         self._kept = KeptArrays(Path(path)) if path else None
-        self._resumed = self._restore()
+        self._watchers = Watchers(self, self._observation.truth_publishers)
+        self._reunion = self._restore()
         # What is missing to draw with shows now, and the first tick is as quick as the others.
         self.world.render()
         self._pace = Pace(self._speed)
@@ -179,13 +181,13 @@ class SimulatorNode(EndingNode):
         """Begin once the modules listen and answer, and the recorder as well if one is awaited."""
         recorded = self._settings["await_recorder"]
         needed = (topics.TORQUE, *[topics.INSTRUCTION] * self._settings["instructed"], *[topics.RECORDED] * recorded)
-        answering = all(self.count_publishers(topic.name) for topic in needed)
-        ended = self._resumed and self._ended  # that end has to be heard; nobody asks for it again
-        if not (answering and self._observation.matched(everything=recorded, ends=ended)):
+        if not all(self.count_publishers(topic.name) for topic in needed):
+            return
+        if not (self._observation.matched(everything=recorded) and may_speak(self._reunion)):
             return
         self._start_timer.cancel()
         self._started = time.perf_counter()
-        if self._resumed:
+        if self._reunion is not None:
             self._offer()
             self._proceed()  # past an episode's last tick, which nobody answers
         else:
@@ -196,21 +198,21 @@ class SimulatorNode(EndingNode):
         else:
             self.create_timer(self._settings["resend_after"] / 2, self._offer_again)
 
-    def _restore(self) -> bool:
-        """Take up the moment that an earlier process has left, or the first episode; return whether there was one."""
+    def _restore(self) -> Reunion | None:
+        """Take up the moment that an earlier process has left, if there is one, or the first episode."""
         moment = None if self._kept is None else self._kept.read(Moment.of)
         if moment is None:
             self.world.reset([0], [self.episodes[0]])
-            return False
+            return None
         self._place, self._held_torque = moment.place, moment.torque
         self._in_force = conversions.InstructionReading(moment.place.sequence, moment.place.direction)
         self.world.restore([0], moment.world)
-        return True
+        return Reunion(self, self._watchers, moment.watchers, self._proceed)
 
     def _keep(self) -> None:
         if self._kept is not None:
-            moment = Moment(self._place, self._held_torque, dict(self.world.snapshot([0])))
-            self._kept.write(moment.arrays(), self)
+            watchers, world = self._watchers.count(), dict(self.world.snapshot([0]))
+            self._kept.write(Moment(self._place, self._held_torque, watchers, world).arrays(), self)
 
     # Ticks
 
@@ -258,7 +260,7 @@ class SimulatorNode(EndingNode):
 
     def _proceed(self) -> None:
         """In lockstep, go on as soon as the tick has been answered."""
-        while not self._over and self._speed == 0 and self._answered and self._may_step():
+        while not self._over and self._speed == 0 and self._answered and may_speak(self._reunion) and self._may_step():
             self._advance()
 
     def _may_step(self) -> bool:

@@ -17,8 +17,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Unpack
 
+import numpy as np
 import rclpy
 from mujoban_msgs.msg import Episode
+from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
@@ -37,9 +39,10 @@ from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.ending_node import EndingNode
+from mujoban_msgs_py.runtime.reunion import Reunion, Watchers, may_speak
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
-from mujoban_msgs_py.topics import EPISODE, Message, Topic
+from mujoban_msgs_py.topics import EPISODE, QUEUE_DEPTH, Message, Topic
 
 _DEADLINE = 3600.0
 """Seconds after which a wait begins anew."""
@@ -79,6 +82,9 @@ class TickNode(EndingNode):
         self._offers = 0
         self._answered = 0
         self._reported = (0, time.monotonic())
+        self.watchers = Watchers(self, ())
+        """Who reads the outputs and only watches."""
+        self._reunion: Reunion | None = None
 
     @property
     def dropped(self) -> Counter[str]:
@@ -118,20 +124,26 @@ class TickNode(EndingNode):
 
     def create_output(self, topic: Topic) -> Publisher:
         """Return a publisher of a topic."""
-        return self.create_publisher(topic.type, topic.name, topic.qos)
+        publisher = self.create_publisher(topic.type, topic.name, topic.qos)
+        self.watchers = Watchers(self, (*self.watchers.publishers, publisher))
+        return publisher
 
     def keep(self, stamp: int, outputs: Sequence[Output]) -> None:
         """Note that a tick is answered, before anybody else knows; `take_up` goes on from there."""
 
-    def take_up(self, stamp: int, outputs: Sequence[Output]) -> None:
+    def take_up(self, stamp: int, outputs: Sequence[Output], watched: NDArray[np.int64]) -> None:
         """Go on after the tick that another process had answered last, and say its answer again to who has missed it.
 
         Args:
             stamp: Of the tick.
             outputs: The answer, with messages as they are or serialised.
+            watched: How many watched the outputs, `Watchers.count`.
+
+        Raises:
+            ValueError: If `watched` is not of these outputs.
         """
         self._handled, self._outputs = stamp, outputs
-        self._publish()
+        self._reunion = Reunion(self, self.watchers, watched, self._publish)
 
     def retry(self) -> None:
         """Ask `answer` again about the tick that it could not answer yet."""
@@ -189,11 +201,13 @@ class TickNode(EndingNode):
             self.retry()
 
     def _publish(self) -> None:
+        if not may_speak(self._reunion):
+            return
         for publisher, message in self._outputs:
             publisher.publish(message)
 
 
-def live_qos(depth: int = 64) -> QoSProfile:
+def live_qos(depth: int = QUEUE_DEPTH) -> QoSProfile:
     """Return the QoS of a reader that wants nothing from before its time, and after that everything."""
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 

@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.exceptions import InvalidParameterValueException
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from safetensors.numpy import save
 from sensor_msgs.msg import Image, JointState
@@ -23,6 +24,7 @@ from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.runtime.reunion import PATIENCE
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.node import PARAMETERS, SimulatorNode
 from mujoban_sokoban.episodes import Episodes
@@ -80,6 +82,40 @@ def test_a_simulator_that_is_killed_at_an_episodes_last_tick_begins_the_next_one
     graph.graph.stop("simulator")
     graph.graph.start("simulator")
     assert [result.seed for result in graph.finish()] == [0, 1]
+
+
+@pytest.mark.parametrize(("name", "topic"), [("simulator", topics.TRUE_POSE), ("termination", topics.TERMINATION)])
+def test_a_node_that_was_killed_waits_for_who_watched_it(play_graph, tmp_path, name, topic):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1), memories=tmp_path)
+    heard, watcher = [], graph.graph.add(Node("watcher"))
+
+    def hear(message):
+        heard.append(conversions.stamp_of(message))
+
+    subscription = watcher.create_subscription(topic.type, topic.name, hear, topic.qos)
+    graph.spin_until(lambda: len(heard) >= 5)
+    graph.graph.stop(name)
+    watcher.destroy_subscription(subscription)
+    said, since = len(graph.said.torque), time.monotonic()
+    graph.graph.start(name)
+    while time.monotonic() - since < PATIENCE / 2:
+        graph.graph.executor.spin_once(timeout_sec=0.05)
+    assert len(graph.said.torque) <= said + 1, "the run has gone on without who watched it"
+    watcher.create_subscription(topic.type, topic.name, hear, topic.qos)
+    (result,) = graph.finish()
+    assert result.solved and heard == sorted(heard)
+    assert set(range(heard[0], heard[-1] + 1, topics.TICK)) == set(heard), "a tick was not heard"
+
+
+def test_a_node_that_was_killed_waits_no_longer_for_who_has_left(play_graph, tmp_path):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1), memories=tmp_path)
+    watcher, topic = graph.graph.add(Node("watcher")), topics.TERMINATION
+    subscription = watcher.create_subscription(topic.type, topic.name, lambda m: None, topic.qos)
+    graph.spin_until(lambda: len(graph.said.torque) >= 10)
+    graph.graph.stop("termination")
+    watcher.destroy_subscription(subscription)
+    graph.graph.start("termination")
+    assert graph.finish()[0].solved
 
 
 def test_modules_that_are_killed_go_on_from_what_they_remember_as_if_nothing_had_happened(
