@@ -14,7 +14,6 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 from torch import Tensor
-from torch.utils.tensorboard.writer import SummaryWriter
 
 from mujoban_core.text import readable
 from mujoban_rl.run_directory import RunDirectory
@@ -71,6 +70,9 @@ class TrainingLog:
             console: Where progress is shown; by default stderr.
             line_seconds: Between two lines of progress, where there is no terminal.
         """
+        # Takes a quarter of a second to import, which nodes can do without.
+        from torch.utils.tensorboard.writer import SummaryWriter
+
         self._writer = SummaryWriter(str(run.path / "tensorboard"))
         self._file = (run.path / "metrics.jsonl").open("a", encoding="utf-8")
         self._console = console or Console(stderr=True)
