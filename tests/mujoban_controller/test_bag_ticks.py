@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -22,10 +20,11 @@ from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.mpo import AsymmetricConfig
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
-from mujoban_controller.train import NetworkConfig, Options, TrainConfig, make_trainer
+from mujoban_controller.train import NetworkConfig, Options, TrainConfig, main, make_trainer
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.grid import INSTRUCTION_LIMIT
 from mujoban_core.interfaces import Observation, TerminationOutput
+from mujoban_core.program import exit_status
 from mujoban_core.sense_plan_act import Decision
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
@@ -167,19 +166,16 @@ def test_labels_are_what_the_teacher_would_have_done_with_the_side_ahead():
     assert not np.array_equal(found[1], ahead[1])
 
 
-def test_a_missing_topic_is_named_in_one_line(recorded, tmp_path):
+def test_a_missing_topic_is_named_in_one_line(recorded, tmp_path, capsys):
     bag = open_training_bag(recorded[0] / "row000", TOPICS)
     kept = [t for t in topics.GRAPH_TOPICS.values() if t.name in bag.topics and t is not topics.TORQUE]
     with BagWriter(tmp_path / "bag", kept) as writer:
         for message in bag.messages([t.name for t in kept]):
             writer.write(message.topic, message.stamp, message.data)
-    command = [
-        sys.executable, "-m", "mujoban_controller.train", "--stage", "mpo", "--run", str(tmp_path / "run"),
-        "--bags", str(tmp_path / "bag"),
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "lacks /torque" in done.stderr and done.stderr.count("\n") == 1
+    command = ["--stage", "mpo", "--run", str(tmp_path / "run"), "--bags", str(tmp_path / "bag")]
+    assert exit_status("train", lambda: main(command)) == 2
+    said = capsys.readouterr().err
+    assert "lacks /torque" in said and said.count("\n") == 1
 
 
 def test_episodes_that_are_kept_for_tests_are_refused(tmp_path):

@@ -1,5 +1,3 @@
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,6 +13,7 @@ from mujoban_core.bodies import BALL
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import GroundTruth, Observation, TerminationOutput
 from mujoban_core.plugins import ROLES
+from mujoban_core.program import exit_status
 from mujoban_core.sense_plan_act import Decision
 from mujoban_estimator import load, load_termination
 from mujoban_estimator.bag_stream import TOPICS, BagStream, stretches
@@ -24,7 +23,7 @@ from mujoban_estimator.learner import EstimatorLearner, LearnerConfig, TrainConf
 from mujoban_estimator.losses import missed_steps
 from mujoban_estimator.metrics import MapScores, TerminationScores
 from mujoban_estimator.termination import TerminationConfig
-from mujoban_estimator.train import Options, make_trainer
+from mujoban_estimator.train import Options, main, make_trainer
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
 from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
@@ -255,10 +254,11 @@ def test_disturbances_must_be_probabilities():
         Disturbance(delay=2)
 
 
-def test_the_command_names_a_bad_bag_in_one_line(tmp_path):
-    command = [sys.executable, "-m", "mujoban_estimator.train", "--bags", str(tmp_path), "--run", str(tmp_path / "run")]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "no bag in" in done.stderr
+def test_the_command_names_a_bad_bag_in_one_line(tmp_path, capsys):
+    command = ["--bags", str(tmp_path), "--run", str(tmp_path / "run")]
+    assert exit_status("train", lambda: main(command)) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "no bag in" in said
 
 
 def test_what_is_recorded_can_be_learned_from_and_learning_goes_on_where_it_stopped(tmp_path):
