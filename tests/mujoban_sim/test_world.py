@@ -227,7 +227,7 @@ def test_the_eased_world_stays_as_it_was_before_worlds_had_names():
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_random_torques_never_throw_anything_out_of_the_grid(name):
-    batch, steps = 32, 400
+    batch, steps = 64, 400
     world = World(batch, world=name, time_limit=10**9)
     levels = generate_levels(5, range(batch))
     world.reset(np.arange(batch), [EpisodeSpec(level, i) for i, level in enumerate(levels)])
