@@ -27,12 +27,12 @@ class EndingNode(Node):
         super().destroy_node()
 
     def create_timer(
-        self, timer_period_sec: float, callback: Callable[[], object] | None, *args: Any, **options: Any
+        self, timer_period_sec: float, callback: Callable[[], object], *args: Any, **options: Any
     ) -> Timer:
         """Make a timer as `rclpy.node.Node` does; it stands still once the node was destroyed."""
 
         def call() -> None:
-            if not self.ended and callback is not None:
+            if not self.ended:
                 callback()
 
         return super().create_timer(timer_period_sec, call, *args, **options)

@@ -12,16 +12,15 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from mujoban_msgs_py.listening import NAMELESS, node_of
 from mujoban_msgs_py.topics import PUBLISHERS
 
 PERIOD: Final = 0.02
 """Seconds between two looks at whether all are back."""
 PATIENCE: Final = 2.5
 """Seconds for which a node waits at most, once it is back: who watched may have left."""
-_GRAPH: Final = frozenset(PUBLISHERS.values())
+_GRAPH: Final = frozenset(f"/{name}" for name in PUBLISHERS.values())
 """Nodes of the graph. They take part in every tick, and those that were killed stay known for a while."""
-_NAMELESS: Final = "_NODE_NAME_UNKNOWN_"
-"""What rclpy calls the node of a reader of which the name has not arrived yet."""
 
 
 class Watchers:
@@ -41,9 +40,9 @@ class Watchers:
         publisher = self.publishers[index]
         readers, watchers = self._known[index]
         if (now := publisher.get_subscription_count()) != readers:
-            names = [info.node_name for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
-            watchers = sum(name not in _GRAPH and name != _NAMELESS for name in names)
-            if _NAMELESS not in names:
+            names = [node_of(info) for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
+            watchers = sum(name not in _GRAPH and name != NAMELESS for name in names)
+            if NAMELESS not in names:
                 self._known[index] = now, watchers
         return watchers
 
