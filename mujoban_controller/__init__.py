@@ -26,10 +26,11 @@ def load(path: str | Path | None = None, device: str = "cpu") -> Controller:
     """
     from mujoban_controller.controller import VisuomotorController
     from mujoban_controller.privileged import PrivilegedPolicy
-    from mujoban_controller.privileged_controller import PrivilegedController
     from mujoban_rl.weights import load_weights, read_record
 
     file = Path(path or SHIPPED)
     if file.is_file() and read_record(file)["class"] == PrivilegedPolicy.__name__:
+        from mujoban_controller.privileged_controller import PrivilegedController
+
         return PrivilegedController(load_weights(PrivilegedPolicy, file, device))
     return load_weights(VisuomotorController, file, device)

@@ -6,6 +6,7 @@ feature map, C its channels, D channels of a cell's embedding, L those of the be
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Final, NamedTuple
 
@@ -86,9 +87,9 @@ class GeometricAttention(nn.Module):
         nn.init.zeros_(last.weight)  # pyright: ignore[reportArgumentType]
         nn.init.zeros_(last.bias)  # pyright: ignore[reportArgumentType]
         pixel = 2.0 / FEATURE_SIZE
-        self.log_width = nn.Parameter(torch.full((len(ANCHORS), 2), 0.7 * pixel).log())
-        centres = (torch.arange(FEATURE_SIZE) + 0.5) * pixel - 1.0
-        self.register_buffer("centres", centres, persistent=False)
+        self.log_width = nn.Parameter(torch.full((len(ANCHORS), 2), math.log(0.7 * pixel)))
+        centres = (np.arange(FEATURE_SIZE) + 0.5) * pixel - 1.0
+        self.register_buffer("centres", torch.tensor(centres, dtype=torch.float32), persistent=False)
 
     def forward(self, features: Tensor, relative: Tensor, pixels: Tensor, visible: Tensor) -> Tensor:
         """Return the features at which each cell's anchors look; zeros for anchors out of the frame.

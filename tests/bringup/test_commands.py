@@ -304,6 +304,14 @@ def test_an_interrupted_recording_leaves_whole_bags_of_all_its_processes(tmp_pat
     assert len([message for bag in bags.iterdir() for message in open_bag(bag).messages()]) > 0
 
 
+def test_modules_are_loaded_without_pytorchs_compiler():
+    load = "from mujoban_core.plugins import *; [load_module(role, LEARNED, None, 'cpu') for role in ROLES]"
+    compiler = ["torch._dynamo", "sympy"]  # some seconds of imports
+    code = f"import sys; {load}; print([name for name in {compiler} if name in sys.modules])"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.stdout.strip() == "[]", ended.stderr
+
+
 def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capfd):
     report, few = tmp_path / "out.json", ["--difficulty", 1, "--episodes", 1, "--time-limit", 20, "--body", "ant"]
     oracles = ["--oracle", "estimator,termination,planner"]
