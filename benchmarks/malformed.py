@@ -13,9 +13,9 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.tick_node import live_qos
-from mujoban_msgs_py.topics import EPISODE, GRAPH_TOPICS, RECORDED, TICK, Topic
+from mujoban_msgs_py.topics import EPISODE, GRAPH_TOPICS, MONITORED, RECORDED, TICK, Topic
 
-TARGETS: Final = (*GRAPH_TOPICS.values(), RECORDED)
+TARGETS: Final = (*GRAPH_TOPICS.values(), RECORDED, MONITORED)
 """Topics that are attacked."""
 KINDS: Final = ("garbage", "truncated", "flipped", "extended", "field", "field", "stamp", "replayed")
 """What is done to a message, in turns."""

@@ -119,6 +119,12 @@ class InProcess:
         self.executor.add_node(node)
         return node
 
+    def end(self, node: Node) -> None:
+        """End a node that `add` has been given."""
+        self._others.remove(node)
+        self.executor.remove_node(node)
+        node.destroy_node()
+
     def counts(self) -> Counter[str]:
         """Return the events that a user should know of, by node and kind."""
         return Counter({f"{name}: {kind}": n for name, node in self.nodes.items() for kind, n in node.counts.items()})
@@ -126,6 +132,9 @@ class InProcess:
 
 class Processes:
     """One process for each node; those that end are started again.
+
+    Processes hear of each other one by one, and what is said before is lost. So in lockstep no tick passes which the
+    monitor, in a process of its own as well, has not heard.
 
     Attributes:
         restarts: How often each node was started again.
@@ -143,6 +152,7 @@ class Processes:
         self._ends: list[tuple[float, str]] = []
         self._folder = RunFolder()
         keep_memories(parameters, self._folder.path)
+        parameters["simulator"]["await_monitor"] = True
         self._parameter_file = self._folder.path / "parameters.yaml"
         write_parameters(parameters, self._parameter_file)
         self._children = {name: self._start(name) for name in parameters}

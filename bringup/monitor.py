@@ -115,6 +115,7 @@ class MonitorNode(EndingNode):
         for topic in watched:
             steady = topic == topics.TRUE_ABSTRACT_STATE
             listen(self, topic, partial(self._receive, topic.name), qos=qos, steady=steady)
+        self._acknowledge = self.create_publisher(topics.MONITORED.type, topics.MONITORED.name, topics.MONITORED.qos)
         self.watch = PublisherWatch(self, topics.PUBLISHERS | ({topics.TORQUE.name: AGENT} if alone else {}))
 
     @property
@@ -157,6 +158,7 @@ class MonitorNode(EndingNode):
         if self.episode is None or message.episode != self.episode.episode:
             self._log, self._sequence = EpisodeLog(message.seed), 0
         elif message.header.stamp == self.episode.header.stamp:
+            self._confirm()  # the simulator offers the tick again
             return
         self.episode = message
         if self._joined > self.stamp + _AHEAD:  # what was joined was of no tick of the simulator's
@@ -164,6 +166,7 @@ class MonitorNode(EndingNode):
         if message.terminated or message.truncated:
             self._end = message
             self._finish_when_joined()
+        self._confirm()
 
     def _on_tick(self, tick: Watched) -> None:
         self.latest = tick
@@ -173,6 +176,14 @@ class MonitorNode(EndingNode):
             self._sequence = said.sequence
             self._log.decided(tick.truth, tick.estimate, said.direction, tick.termination.timed_out)
         self._finish_when_joined()
+        self._confirm()
+
+    def _confirm(self) -> None:
+        """Say that the latest tick was heard, once it was; in one process nobody asks."""
+        if self.episode is None or not self._acknowledge.get_subscription_count():
+            return
+        if self._joined >= self.stamp or self.episode.terminated or self.episode.truncated:
+            self._acknowledge.publish(conversions.header(self.stamp))
 
     def _finish_when_joined(self) -> None:
         """End the episode when the tick before its last has been noted."""

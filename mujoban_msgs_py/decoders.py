@@ -43,6 +43,7 @@ DECODERS: Final[dict[Topic, Decode]] = {
     topics.TRUE_EPISODE: conversions.episode_truth_from_msg,
     topics.TOP_CAMERA: _any_size,
     topics.RECORDED: conversions.stamp_of,
+    topics.MONITORED: conversions.stamp_of,
 }
 """The reader of every topic."""
 

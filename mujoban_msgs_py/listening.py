@@ -14,7 +14,6 @@ from typing import Any, Final, NamedTuple
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from mujoban_msgs_py.decoders import DECODERS, Decode
 from mujoban_msgs_py.raw import Steady, raw_stamp, read
@@ -27,8 +26,7 @@ _THOROUGH: Final = 10
 """Of so many looks one asks for every publisher's name, which takes 20 ms; the others count them."""
 LEASE: Final = 30.0
 """Seconds for which the publishers of a process that was killed are known at most: Fast DDS gives 20, and looks."""
-NAMELESS: Final = "_NODE_NAMESPACE_UNKNOWN_/_NODE_NAME_UNKNOWN_"
-"""What `node_of` says while the name has not arrived yet."""
+_NAMELESS: Final = "_NODE_NAMESPACE_UNKNOWN_/_NODE_NAME_UNKNOWN_"
 _PATIENCE: Final = 5
 """Looks in a row for which a publisher may be without a name."""
 REJECTED: Final = "rejected messages"
@@ -93,11 +91,6 @@ def _count(node: Node, kind: str) -> None:
         counts[kind] += 1
 
 
-def node_of(endpoint: TopicEndpointInfo) -> str:
-    """Return the full name of the node that has a publisher or a subscription."""
-    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
-
-
 class PublisherWatch:
     """Names those who publish on a graph's topics and do not belong to it, once each.
 
@@ -136,14 +129,17 @@ class PublisherWatch:
     def _foreign(self, topic: str) -> set[str]:
         """Return the nodes that publish on a topic and have no business there."""
         own = f"/{self._publishers[topic]}"
-        names = Counter(map(node_of, self._node.get_publishers_info_by_topic(topic)))
+        names = Counter(
+            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            for info in self._node.get_publishers_info_by_topic(topic)
+        )
         ghosts = self.ghosts(self._publishers[topic])
         if names[own] <= 1 + ghosts:
             del names[own]
         # Who has only just come, or is going, is not known by name for a moment; who was killed may lose it for longer.
-        self._nameless[topic] = self._nameless[topic] + 1 if names[NAMELESS] > ghosts else 0
+        self._nameless[topic] = self._nameless[topic] + 1 if names[_NAMELESS] > ghosts else 0
         if self._nameless[topic] <= _PATIENCE:
-            del names[NAMELESS]
+            del names[_NAMELESS]
         return set(names)
 
     def _topics(self) -> list[str]:

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
 
 TICK: Final = round(CONTROL_PERIOD * 1e9)
 """Nanoseconds of simulated time between two ticks."""
-QUEUE_DEPTH: Final = 256
-"""Messages kept for a reader that is slow or not known yet: 13 s at 20 Hz. In lockstep a node of the graph is never
-more than a few ticks behind; who only watches may be."""
+QUEUE_DEPTH: Final = 64
+"""Messages kept for a slow reader: 3 s at 20 Hz. In lockstep a node is never more than a few ticks behind."""
 LATCHED_DEPTH: Final = 8
 """Messages that a late joiner of a latched topic receives at most; the last one is the latest."""
 
@@ -109,6 +108,8 @@ TOP_CAMERA: Final = Topic("/camera_top/image_raw", Image)
 """o_top, rgb8."""
 RECORDED: Final = Topic("/recorded", Header)
 """The recorder has written the tick of this stamp."""
+MONITORED: Final = Topic("/monitored", Header)
+"""The monitor has heard the tick of this stamp, and what the modules decided in it."""
 
 TRUTH_TOPICS: Final = (TRUE_ABSTRACT_STATE, TRUE_POSE, TRUE_TWIST, TRUE_BOXES, TRUE_TERMINATION, TRUE_EPISODE)
 """What only oracles and recorders receive."""
@@ -125,5 +126,6 @@ PUBLISHERS: Final = {
     INSTRUCTION.name: "planner",
     TORQUE.name: "controller",
     RECORDED.name: "recorder",
+    MONITORED.name: "monitor",
 }
 """Topic -> name of the node that alone publishes on it."""

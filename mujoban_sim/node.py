@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Unpack
 
@@ -25,10 +26,9 @@ from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.ending_node import EndingNode
 from mujoban_msgs_py.runtime.kept import KeptArrays
 from mujoban_msgs_py.runtime.pace import Pace
-from mujoban_msgs_py.runtime.reunion import Reunion, Watchers, may_speak
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.seldom import is_due
-from mujoban_msgs_py.topics import TICK
+from mujoban_msgs_py.topics import TICK, Topic
 from mujoban_sim.observation import ObservationPublisher
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 from mujoban_sim.resume import Moment, Place
@@ -61,6 +61,7 @@ PARAMETERS: Final[dict[str, tuple[Any, ParameterDescriptor]]] = {
     "realtime": (0.0, _setting("simulated seconds per second; 0: lockstep", 0.0, FASTEST)),
     "resend_after": (0.5, _setting("seconds without an answer until a tick is offered again", 0.01, 3600.0)),
     "await_recorder": (False, _setting("whether in lockstep a recorder must have written a tick before the next")),
+    "await_monitor": (False, _setting("whether in lockstep a monitor must have heard a tick before the next")),
     "instructed": (True, _setting("whether torques follow instructions, which a tick then awaits as well")),
     "top_camera_size": (256, _setting("pixels along the edge of /camera_top/image_raw", 1, LARGEST_PICTURE)),
     "resume_file": ("", _setting("file of every tick that is offered, to go on from after a crash; empty: none")),
@@ -83,6 +84,7 @@ class SimulatorNode(EndingNode):
         realtime: Simulated seconds per second; 0 is lockstep.
         resend_after: Seconds without an answer after which a tick is offered again in lockstep.
         await_recorder: Whether in lockstep a recorder must have acknowledged a tick before the next.
+        await_monitor: The same of the monitor. Who is in another process may hear this node later than it is heard.
         instructed: Whether instructions come with the torques; those who play without modules send torques alone.
         top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
         resume_file: Where the node keeps every tick that it offers, so that it goes on from there after it was killed;
@@ -128,14 +130,17 @@ class SimulatorNode(EndingNode):
         self._held_torque = np.zeros(self.world.body.action_size, np.float32)
         self._instruction: conversions.InstructionReading | None = None
         self._in_force = conversions.InstructionReading(0, 0)
-        self._recorded = False
+        self._witnesses: list[Topic] = [
+            *[topics.RECORDED] * self._settings["await_recorder"], *[topics.MONITORED] * self._settings["await_monitor"]
+        ]  # fmt: skip
+        self._unconfirmed: set[Topic] = set()
+        self._clock_runs = False  # in real time, from when the first tick has been answered
         self._paused = False
         self._steps_due = 0
         self._started: float | None = None
         path = self._settings["resume_file"]
         self._kept = KeptArrays(Path(path)) if path else None
-        self._watchers = Watchers(self, self._observation.truth_publishers)
-        self._reunion = self._restore()
+        self._resumed = self._restore()
         # What is missing to draw with shows now, and the first tick is as quick as the others.
         self.world.render()
         self._pace = Pace(self._speed)
@@ -169,8 +174,8 @@ class SimulatorNode(EndingNode):
         listen(self, topics.TORQUE, self._on_torque, decode=self._read_torque)
         # What a planner said before this simulator came must not arrive.
         listen(self, topics.INSTRUCTION, self._on_instruction, qos=live_qos())
-        if self._settings["await_recorder"]:
-            listen(self, topics.RECORDED, self._on_recorded)
+        for topic in self._witnesses:
+            listen(self, topic, partial(self._on_confirmed, topic))
         self.create_service(Trigger, "/reset", self._on_reset)
         self.create_service(SetBool, "/pause", self._on_pause)
         self.create_service(Trigger, "/step", self._on_step)
@@ -178,41 +183,38 @@ class SimulatorNode(EndingNode):
     # Starting
 
     def _start_when_complete(self) -> None:
-        """Begin once the modules listen and answer, and the recorder as well if one is awaited."""
-        recorded = self._settings["await_recorder"]
-        needed = (topics.TORQUE, *[topics.INSTRUCTION] * self._settings["instructed"], *[topics.RECORDED] * recorded)
+        """Begin once the modules listen and answer, and the witnesses as well."""
+        needed = (topics.TORQUE, *[topics.INSTRUCTION] * self._settings["instructed"], *self._witnesses)
         if not all(self.count_publishers(topic.name) for topic in needed):
             return
-        if not (self._observation.matched(everything=recorded) and may_speak(self._reunion)):
+        if not self._observation.matched(everything=topics.RECORDED in self._witnesses):
             return
         self._start_timer.cancel()
         self._started = time.perf_counter()
-        if self._reunion is not None:
+        if self._resumed:
             self._offer()
-            self._proceed()  # past an episode's last tick, which nobody answers
+            self._proceed()  # past an episode's last tick, which no module answers
         else:
             self._begin(self._place.index)
-        self._pace.start(self._started)
+        self.create_timer(self._settings["resend_after"] / 2, self._offer_again)
         if self._speed > 0:
             self.create_timer(CONTROL_PERIOD / self._speed, self._on_clock)
-        else:
-            self.create_timer(self._settings["resend_after"] / 2, self._offer_again)
 
-    def _restore(self) -> Reunion | None:
-        """Take up the moment that an earlier process has left, if there is one, or the first episode."""
+    def _restore(self) -> bool:
+        """Take up the moment that an earlier process has left, or the first episode; return whether there was one."""
         moment = None if self._kept is None else self._kept.read(Moment.of)
         if moment is None:
             self.world.reset([0], [self.episodes[0]])
-            return None
+            return False
         self._place, self._held_torque = moment.place, moment.torque
         self._in_force = conversions.InstructionReading(moment.place.sequence, moment.place.direction)
         self.world.restore([0], moment.world)
-        return Reunion(self, self._watchers, moment.watchers, self._proceed)
+        return True
 
     def _keep(self) -> None:
         if self._kept is not None:
-            watchers, world = self._watchers.count(), dict(self.world.snapshot([0]))
-            self._kept.write(Moment(self._place, self._held_torque, watchers, world).arrays(), self)
+            moment = Moment(self._place, self._held_torque, dict(self.world.snapshot([0])))
+            self._kept.write(moment.arrays(), self)
 
     # Ticks
 
@@ -233,7 +235,7 @@ class SimulatorNode(EndingNode):
     def _offer(self) -> None:
         """Publish the tick and wait for what the modules make of it."""
         self._torque = self._instruction = None
-        self._recorded = not self._settings["await_recorder"]
+        self._unconfirmed.update(self._witnesses)
         self._publish()
 
     def _publish(self) -> None:
@@ -244,7 +246,7 @@ class SimulatorNode(EndingNode):
     def _offer_again(self) -> None:
         """Repeat a tick that stays without an answer: a node may have been started since."""
         waited = time.perf_counter() - self._offered > self._settings["resend_after"]
-        if waited and not (self._answered or self._over):
+        if waited and not (self._answered or self._over or self._clock_runs):
             self.counts["repeated ticks"] += 1
             self._publish()
 
@@ -256,11 +258,11 @@ class SimulatorNode(EndingNode):
     def _answered(self) -> bool:
         """Whether nothing is missing to go on; an episode's last tick needs no answer."""
         told = self._instruction is not None or not self._settings["instructed"]
-        return self._recorded and (self._ended or (self._torque is not None and told))
+        return not self._unconfirmed and (self._ended or (self._torque is not None and told))
 
     def _proceed(self) -> None:
         """In lockstep, go on as soon as the tick has been answered."""
-        while not self._over and self._speed == 0 and self._answered and may_speak(self._reunion) and self._may_step():
+        while not self._over and self._speed == 0 and self._answered and self._may_step():
             self._advance()
 
     def _may_step(self) -> bool:
@@ -275,7 +277,8 @@ class SimulatorNode(EndingNode):
         now = time.perf_counter()
         if self._over:
             return
-        if not self._may_step():
+        self._clock_runs = self._clock_runs or self._answered
+        if not (self._clock_runs and self._may_step()):
             self._pace.start(now)
             return
         if (complaint := self._pace.complaint(now)) is not None:
@@ -333,9 +336,9 @@ class SimulatorNode(EndingNode):
             self._instruction = message.content
             self._proceed()
 
-    def _on_recorded(self, message: Received) -> None:
+    def _on_confirmed(self, topic: Topic, message: Received) -> None:
         if message.stamp == self._stamp:
-            self._recorded = True
+            self._unconfirmed.discard(topic)
             self._proceed()
 
     def _is_known(self, stamp: int, topic: str) -> bool:

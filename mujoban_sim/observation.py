@@ -36,7 +36,6 @@ class ObservationPublisher:
         self._publishers = {t: node.create_publisher(t.type, t.name, t.qos) for t in topics.SIMULATOR_TOPICS}
         self._on_demand = {*topics.TRUTH_TOPICS, topics.TOP_CAMERA, topics.CAMERA_INFO} - {topics.TRUE_EPISODE}
         self._top_readers, self._top_period = 0, 1
-        self.truth_publishers = [self._publishers[topic] for topic in topics.TRUTH_TOPICS]
 
     def matched(self, *, everything: bool) -> bool:
         """Tell whether somebody hears what the modules need, or everything."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 _PLACE = "place"
 """Key of the arrays that hold a `Place`."""
-_TORQUE, _WATCHERS = "held torque", "watchers"
+_TORQUE = "held torque"
 
 
 class Place(NamedTuple):
@@ -33,18 +33,15 @@ class Moment(NamedTuple):
     place: Place
     torque: NDArray[np.float32]
     """Held torque, [U]."""
-    watchers: NDArray[np.int64]
-    """Who watched, `mujoban_msgs_py.runtime.reunion.Watchers.count`."""
     world: dict[str, Any]
     """See `World.snapshot`."""
 
     def arrays(self) -> dict[str, Any]:
         """Return it as arrays by name."""
-        place = np.array(self.place, np.int64)
-        return {**self.world, _PLACE: place, _TORQUE: self.torque, _WATCHERS: self.watchers}
+        return {**self.world, _PLACE: np.array(self.place, np.int64), _TORQUE: self.torque}
 
     @classmethod
     def of(cls, arrays: dict[str, Any]) -> Moment:
         """Return the moment that `arrays` returned; a KeyError or TypeError says that they are those of none."""
         world = dict(arrays)
-        return cls(Place(*world.pop(_PLACE).tolist()), world.pop(_TORQUE), world.pop(_WATCHERS), world)
+        return cls(Place(*world.pop(_PLACE).tolist()), world.pop(_TORQUE), world)

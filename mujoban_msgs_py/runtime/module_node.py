@@ -27,9 +27,8 @@ from mujoban_msgs_py.topics import Topic
 
 MOST_TICKS = 1_000_000
 """Upper end of ranges of ticks, which have none of their own."""
-_PLACE, _ANSWER, _WATCHERS, _LEAF = "place", "answer", "watchers", "state."
-"""Keys of what a node keeps: the number of the episode and the stamp of the tick; its answer; who watched; arrays of
-the state."""
+_PLACE, _ANSWER, _LEAF = "place", "answer", "state."
+"""Keys of what a node keeps: the number of the episode and the stamp of the tick; its answer; arrays of the state."""
 TRUTH_INPUTS = (
     Input(topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_from_msg),
     Input(topics.TRUE_POSE, conversions.pose_from_msg),
@@ -135,17 +134,16 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         arrays: dict[str, Any] = {f"{_LEAF}{i}": leaf for i, leaf in enumerate(leaves(self.state))}
         arrays[_PLACE] = np.array([self._episode, stamp])
         arrays[_ANSWER] = np.frombuffer(b"".join(serialize_message(o.message) for o in outputs), np.uint8)
-        arrays[_WATCHERS] = self.watchers.count()
         self._kept.write(arrays, self)
 
     def _resume(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Take up what `keep` has kept; a KeyError or ValueError says that it is not that of such a module."""
         number, stamp = arrays[_PLACE].tolist()
         answer = arrays[_ANSWER].tobytes()
-        kept = (arrays[f"{_LEAF}{i}"] for i in range(len(arrays) - 3))
+        kept = (arrays[f"{_LEAF}{i}"] for i in range(len(arrays) - 2))
         self.state = with_leaves(self.initial_state(number), kept)
         self._episode = number
-        self.take_up(stamp, [Output(self._publisher, answer)] if answer else (), arrays[_WATCHERS])
+        self.take_up(stamp, [Output(self._publisher, answer)] if answer else ())
 
     def _load(self, weights: str, device: str) -> ModuleT:
         module = load_module(self.role, self._source, Path(weights) if weights else None, device)

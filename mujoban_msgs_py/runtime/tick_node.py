@@ -17,10 +17,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Unpack
 
-import numpy as np
 import rclpy
 from mujoban_msgs.msg import Episode
-from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
@@ -39,7 +37,6 @@ from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.ending_node import EndingNode
-from mujoban_msgs_py.runtime.reunion import Reunion, Watchers, may_speak
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import EPISODE, QUEUE_DEPTH, Message, Topic
@@ -82,9 +79,6 @@ class TickNode(EndingNode):
         self._offers = 0
         self._answered = 0
         self._reported = (0, time.monotonic())
-        self.watchers = Watchers(self, ())
-        """Who reads the outputs and only watches."""
-        self._reunion: Reunion | None = None
 
     @property
     def dropped(self) -> Counter[str]:
@@ -120,30 +114,25 @@ class TickNode(EndingNode):
         report_on(self, self._condition)
         for topic, decode in every:
             receive = partial(self._receive, topic, decode)
-            self.create_subscription(topic.type, topic.name, receive, topic.qos, raw=True)
+            # What was said before this node came belongs to ticks that are over; the open one is offered again.
+            self.create_subscription(topic.type, topic.name, receive, live_qos(), raw=True)
 
     def create_output(self, topic: Topic) -> Publisher:
         """Return a publisher of a topic."""
-        publisher = self.create_publisher(topic.type, topic.name, topic.qos)
-        self.watchers = Watchers(self, (*self.watchers.publishers, publisher))
-        return publisher
+        return self.create_publisher(topic.type, topic.name, topic.qos)
 
     def keep(self, stamp: int, outputs: Sequence[Output]) -> None:
         """Note that a tick is answered, before anybody else knows; `take_up` goes on from there."""
 
-    def take_up(self, stamp: int, outputs: Sequence[Output], watched: NDArray[np.int64]) -> None:
+    def take_up(self, stamp: int, outputs: Sequence[Output]) -> None:
         """Go on after the tick that another process had answered last, and say its answer again to who has missed it.
 
         Args:
             stamp: Of the tick.
             outputs: The answer, with messages as they are or serialised.
-            watched: How many watched the outputs, `Watchers.count`.
-
-        Raises:
-            ValueError: If `watched` is not of these outputs.
         """
         self._handled, self._outputs = stamp, outputs
-        self._reunion = Reunion(self, self.watchers, watched, self._publish)
+        self._publish()
 
     def retry(self) -> None:
         """Ask `answer` again about the tick that it could not answer yet."""
@@ -201,8 +190,6 @@ class TickNode(EndingNode):
             self.retry()
 
     def _publish(self) -> None:
-        if not may_speak(self._reunion):
-            return
         for publisher, message in self._outputs:
             publisher.publish(message)
 

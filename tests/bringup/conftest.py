@@ -28,6 +28,7 @@ ORACLES = Stack({role: Choice(role, "oracle") for role in ROLES})
 class Said:
     """What was said, by stamp."""
 
+    estimate: dict[int, bytes] = field(default_factory=dict)
     instruction: dict[int, tuple[int, int]] = field(default_factory=dict)
     torque: dict[int, list[float]] = field(default_factory=dict)
     reward: dict[int, float] = field(default_factory=dict)
@@ -35,13 +36,14 @@ class Said:
 
 
 class Tap(Node):
-    """Notes instructions, torques and rewards."""
+    """Notes estimates, instructions, torques and rewards."""
 
     def __init__(self):
         super().__init__("tap")
         self.said = Said()
         self.create_subscription(EpisodeTruth, topics.TRUE_EPISODE.name, self._episode, live_qos(1000))
         self.create_subscription(Instruction, topics.INSTRUCTION.name, self._instruction, live_qos(1000))
+        listen(self, topics.ABSTRACT_STATE, self._estimate, qos=live_qos(1000))
         listen(self, topics.TORQUE, self._torque, qos=live_qos(1000))
 
     def _episode(self, message):
@@ -50,6 +52,9 @@ class Tap(Node):
 
     def _instruction(self, message):
         self.said.instruction[stamp_of(message)] = (message.sequence, message.direction)
+
+    def _estimate(self, message):
+        self.said.estimate[message.stamp] = message.raw
 
     def _torque(self, message):
         self.said.torque[message.stamp] = message.content.tolist()

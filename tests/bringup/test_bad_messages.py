@@ -39,9 +39,7 @@ def test_spoiled_messages_on_every_topic_end_nothing_and_what_is_recorded_is_sou
     assert graph.finish()
     for node in (recorder, viz, *graph.graph.nodes.values()):
         assert node.counts["rejected messages"] >= 3, node.get_name()
-    graph.graph.executor.remove_node(recorder)
-    graph.graph._others.remove(recorder)
-    recorder.destroy_node()
+    graph.graph.end(recorder)
     assert sum(1 for _ in open_bag(tmp_path / "bag").read()) > 100, "every recorded message can be read"
 
 
@@ -193,7 +191,7 @@ def test_a_flood_of_instructions_does_not_wash_away_the_one_that_is_waited_for(p
 
 
 def test_every_topic_is_attacked():
-    assert {topic.name for topic in TARGETS} == {*topics.GRAPH_TOPICS, topics.RECORDED.name}
+    assert {topic.name for topic in TARGETS} == {*topics.GRAPH_TOPICS, topics.RECORDED.name, topics.MONITORED.name}
 
 
 def test_what_is_wrong_again_and_again_is_counted_each_time_and_said_seldom_without_asking_who_calls(

@@ -12,7 +12,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.exceptions import InvalidParameterValueException
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from safetensors.numpy import save
 from sensor_msgs.msg import Image, JointState
@@ -24,7 +23,6 @@ from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.runtime.reunion import PATIENCE
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.node import PARAMETERS, SimulatorNode
 from mujoban_sokoban.episodes import Episodes
@@ -84,42 +82,35 @@ def test_a_simulator_that_is_killed_at_an_episodes_last_tick_begins_the_next_one
     assert [result.seed for result in graph.finish()] == [0, 1]
 
 
-@pytest.mark.parametrize(("name", "topic"), [("simulator", topics.TRUE_POSE), ("termination", topics.TERMINATION)])
-def test_a_node_that_was_killed_waits_for_who_watched_it(play_graph, tmp_path, name, topic):
-    graph = play_graph(episodes=Episodes(1, 0, difficulty=1), memories=tmp_path)
-    heard, watcher = [], graph.graph.add(Node("watcher"))
-
-    def hear(message):
-        heard.append(conversions.stamp_of(message))
-
-    subscription = watcher.create_subscription(topic.type, topic.name, hear, topic.qos)
-    graph.spin_until(lambda: len(heard) >= 5)
-    graph.graph.stop(name)
-    watcher.destroy_subscription(subscription)
-    said, since = len(graph.said.torque), time.monotonic()
-    graph.graph.start(name)
-    while time.monotonic() - since < PATIENCE / 2:
-        graph.graph.executor.spin_once(timeout_sec=0.05)
-    assert len(graph.said.torque) <= said + 1, "the run has gone on without who watched it"
-    watcher.create_subscription(topic.type, topic.name, hear, topic.qos)
-    (result,) = graph.finish()
-    assert result.solved and heard == sorted(heard)
-    assert set(range(heard[0], heard[-1] + 1, topics.TICK)) == set(heard), "a tick was not heard"
+def test_in_lockstep_no_tick_passes_that_an_awaited_monitor_has_not_heard(play_graph):
+    episodes = Episodes(1, 0, difficulty=1)
+    graph = play_graph(episodes=episodes, await_monitor=True)
+    graph.spin_until(lambda: graph.monitor.ticks >= 10)
+    graph.graph.end(graph.monitor)
+    before = graph.monitor.ticks
+    graph.spin_until(lambda: graph.simulator.counts["repeated ticks"] >= 2)
+    assert graph.simulator.ticks <= before, "the world has gone on unheard"
+    monitor = graph.graph.add(MonitorNode(episodes))
+    graph.spin_until(monitor.finished.done)
+    assert monitor.results[0].solved and before + monitor.ticks >= graph.simulator.ticks
 
 
-def test_a_node_that_was_killed_waits_no_longer_for_who_has_left(play_graph, tmp_path):
-    graph = play_graph(episodes=Episodes(1, 0, difficulty=1), memories=tmp_path)
-    watcher, topic = graph.graph.add(Node("watcher")), topics.TERMINATION
-    subscription = watcher.create_subscription(topic.type, topic.name, lambda m: None, topic.qos)
-    graph.spin_until(lambda: len(graph.said.torque) >= 10)
-    graph.graph.stop("termination")
-    watcher.destroy_subscription(subscription)
-    graph.graph.start("termination")
-    assert graph.finish()[0].solved
+def test_in_real_time_the_clock_starts_when_the_awaited_monitor_has_heard_the_first_tick(play_graph):
+    episodes = Episodes(1, 0, difficulty=1)
+    graph = play_graph(names=(), episodes=episodes, await_monitor=True, realtime=20.0)
+    graph.graph.end(graph.monitor)
+    for name in NODES:
+        graph.graph.start(name)
+    graph.tap.create_publisher(topics.MONITORED.type, topics.MONITORED.name, topics.MONITORED.qos)  # and says nothing
+    graph.spin_until(lambda: graph.simulator.counts["repeated ticks"] >= 2)
+    assert graph.simulator.ticks == 0
+    monitor = graph.graph.add(MonitorNode(episodes))
+    graph.spin_until(monitor.finished.done)
+    assert monitor.results[0].solved and 0 in {e.step for e in graph.said.episodes.values()}
 
 
 def test_modules_that_are_killed_go_on_from_what_they_remember_as_if_nothing_had_happened(
-    play_graph, fresh_weights, tmp_path
+    play_graph, fresh_weights, tmp_path, capfd
 ):
     stack = Stack(fresh_weights.choices | {"planner": Choice("planner")}, look_around=5)
     episodes = Episodes(2, 5, difficulty=3)
@@ -127,13 +118,15 @@ def test_modules_that_are_killed_go_on_from_what_they_remember_as_if_nothing_had
     expected = undisturbed.finish()
     undisturbed.__exit__(None, None, None)
     graph = play_graph(stack, episodes, time_limit=40, memories=tmp_path)
-    for ticks, names in ((8, MODULES[:1]), (16, MODULES[1:2]), (24, MODULES[2:3]), (32, MODULES[3:]), (60, MODULES)):
+    for ticks, names in ((4, MODULES[:1]), (16, MODULES[1:2]), (24, MODULES[2:3]), (32, MODULES[3:]), (60, MODULES)):
         graph.spin_until(lambda ticks=ticks: len(graph.said.torque) >= ticks)
         for name in names:
             graph.graph.stop(name)
         for name in names:
             graph.graph.start(name)
     assert graph.finish() == expected
+    assert "jumped back" not in capfd.readouterr().err, "what was said before the kill is taken for another run"
+    assert graph.said.estimate == undisturbed.said.estimate
     assert graph.said.instruction == undisturbed.said.instruction
     assert graph.said.torque == undisturbed.said.torque
 
