@@ -5,6 +5,7 @@ size and values that are not finite raise `ConversionError`, so that nothing bad
 The readers take what rclpy delivers and what `rosbags` deserialises alike. Round trips are exact.
 
 Array fields are filled with `array.array`: all else is 1,000 times slower. Scalars are Python's: NumPy's get corrupted.
+A message makes its parts itself, also those that its constructor is given: so they are filled where they are.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, Quaternion, TwistStamped, Vector3
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, TwistStamped
 from mujoban_msgs.msg import AbstractState, Episode, EpisodeTruth, Instruction, Proprioception, Termination
 from numpy.typing import ArrayLike, NDArray
 from rosgraph_msgs.msg import Clock
@@ -121,16 +122,20 @@ def proprio_to_msg(header: Header, proprio: ArrayLike, joints: Sequence[str]) ->
     """Return o_pr, [P], in the layout of `mujoban_core.bodies.ProprioSlices`, of a body with these joints."""
     part = ProprioSlices.of(len(joints))
     values = _finite("proprio", proprio, (part.size,), np.float64).tolist()
-    return Proprioception(
+    message = Proprioception(
         header=header,
         name=list(joints),
         position=array("d", values[part.joint_position]),
         velocity=array("d", values[part.joint_velocity]),
-        linear_velocity=_vector(values[part.linear_velocity]),
-        angular_velocity=_vector(values[part.angular_velocity]),
-        linear_acceleration=_vector(values[part.linear_acceleration]),
-        world_z_axis=_vector(values[part.up_axis]),
     )
+    for vector, where in (
+        (message.linear_velocity, part.linear_velocity),
+        (message.angular_velocity, part.angular_velocity),
+        (message.linear_acceleration, part.linear_acceleration),
+        (message.world_z_axis, part.up_axis),
+    ):
+        vector.x, vector.y, vector.z = values[where]
+    return message
 
 
 def proprio_from_msg(message: Proprioception) -> NDArray[np.float32]:
@@ -158,8 +163,11 @@ def body_proprio_from_msg(message: Proprioception) -> NDArray[np.float32]:
 def pose_to_msg(header: Header, pose: ArrayLike) -> PoseStamped:
     """Return a pose (x [m], y [m], psi [rad]), [3]; psi in [-pi, pi]."""
     x, y, yaw = _finite("pose", pose, (3,), np.float64).tolist()
-    orientation = Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
-    return PoseStamped(header=header, pose=Pose(position=Point(x=x, y=y), orientation=orientation))
+    message = PoseStamped(header=header)
+    position, orientation = message.pose.position, message.pose.orientation
+    position.x, position.y = x, y
+    orientation.z, orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+    return message
 
 
 def pose_from_msg(message: PoseStamped) -> NDArray[np.float32]:
@@ -394,7 +402,3 @@ def _direction(value: int) -> int:
         names = ", ".join(f"{d.value} ({d.name})" for d in Direction)
         raise ConversionError(f"direction must be one of {names}, got {direction}")
     return direction
-
-
-def _vector(values: Sequence[float]) -> Vector3:
-    return Vector3(x=values[0], y=values[1], z=values[2])

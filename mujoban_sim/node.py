@@ -130,9 +130,8 @@ class SimulatorNode(EndingNode):
         self._held_torque = np.zeros(self.world.body.action_size, np.float32)
         self._instruction: conversions.InstructionReading | None = None
         self._in_force = conversions.InstructionReading(0, 0)
-        self._witnesses: list[Topic] = [
-            *[topics.RECORDED] * self._settings["await_recorder"], *[topics.MONITORED] * self._settings["await_monitor"]
-        ]  # fmt: skip
+        awaited = {"await_recorder": topics.RECORDED, "await_monitor": topics.MONITORED}
+        self._witnesses = [topic for name, topic in awaited.items() if self._settings[name]]
         self._unconfirmed: set[Topic] = set()
         self._clock_runs = False  # in real time, from when the first tick has been answered
         self._paused = False
@@ -185,9 +184,8 @@ class SimulatorNode(EndingNode):
     def _start_when_complete(self) -> None:
         """Begin once the modules listen and answer, and the witnesses as well."""
         needed = (topics.TORQUE, *[topics.INSTRUCTION] * self._settings["instructed"], *self._witnesses)
-        if not all(self.count_publishers(topic.name) for topic in needed):
-            return
-        if not self._observation.matched(everything=topics.RECORDED in self._witnesses):
+        answering = all(self.count_publishers(topic.name) for topic in needed)
+        if not (answering and self._observation.matched(everything=topics.RECORDED in self._witnesses)):
             return
         self._start_timer.cancel()
         self._started = time.perf_counter()

@@ -21,8 +21,8 @@ GLANCE = 4
 class ObservationPublisher:
     """Publishes the state of the only row of a world.
 
-    Ground truth and the view from above, which cost time and which no learned module receives, are published
-    while somebody subscribes to them; the view from above only now and then while nobody needs all of it.
+    What no learned module receives costs time as well: it is published while somebody subscribes to it; the view from
+    above only now and then while nobody needs all of it.
     """
 
     def __init__(self, node: Node, world: World, top_camera_size: int) -> None:
@@ -34,7 +34,7 @@ class ObservationPublisher:
         self._top_camera_size = top_camera_size
         self._composer = TickComposer(world.body)
         self._publishers = {t: node.create_publisher(t.type, t.name, t.qos) for t in topics.SIMULATOR_TOPICS}
-        self._on_demand = {*topics.TRUTH_TOPICS, topics.TOP_CAMERA, topics.CAMERA_INFO} - {topics.TRUE_EPISODE}
+        self._on_demand = {*topics.SIMULATOR_TOPICS} - {*_NEEDED, topics.TRUE_EPISODE}
         self._top_readers, self._top_period = 0, 1
 
     def matched(self, *, everything: bool) -> bool:

@@ -6,6 +6,7 @@ Nothing here needs rclpy.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 from geometry_msgs.msg import PoseArray
@@ -20,6 +21,9 @@ from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.topics import Message, Topic
 from mujoban_sokoban.episodes import EpisodeSpec
+
+_header = lru_cache(maxsize=8)(conversions.header)
+"""Makes a header once for all messages of a tick in its frame, which leave it as it is."""
 
 
 class TickLabel(NamedTuple):
@@ -118,15 +122,15 @@ class TickComposer:
         return conversions.episode_truth_to_msg(_map(tick), reading)
 
     def _camera(self, tick: SimulatorTick) -> Image:
-        header = conversions.header(tick.label.stamp, topics.CAMERA_FRAME)
+        header = _header(tick.label.stamp, topics.CAMERA_FRAME)
         return conversions.frame_to_msg(header, tick.observation.frame[tick.row])
 
     def _camera_info(self, tick: SimulatorTick) -> CameraInfo:
-        header = conversions.header(tick.label.stamp, topics.CAMERA_FRAME)
+        header = _header(tick.label.stamp, topics.CAMERA_FRAME)
         return conversions.camera_info_to_msg(header, self._intrinsics)
 
     def _proprio(self, tick: SimulatorTick) -> Proprioception:
-        header = conversions.header(tick.label.stamp, topics.BODY_FRAME)
+        header = _header(tick.label.stamp, topics.BODY_FRAME)
         return conversions.proprio_to_msg(header, tick.observation.proprio[tick.row], self._joints)
 
     def _abstract_state(self, tick: SimulatorTick) -> AbstractState:
@@ -142,4 +146,4 @@ class TickComposer:
 
 
 def _map(tick: SimulatorTick) -> Header:
-    return conversions.header(tick.label.stamp, topics.MAP_FRAME)
+    return _header(tick.label.stamp, topics.MAP_FRAME)
