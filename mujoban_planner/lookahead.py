@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mujoban_core.grid import BOX, TARGET, WALL, Instruction
 from mujoban_core.interfaces import Memory, Module, Planner, put_rows, take_rows
+from mujoban_planner import MOST_EVALUATIONS
 from mujoban_planner.abstract_env import MOVE_LIMIT, AbstractEnvironment
 from mujoban_planner.boards import BitBoards, likeliest_boards, state_tensor
 from mujoban_planner.decision import PushMeans, VisitCounts, count_visits, recall, remember, state_keys
@@ -32,8 +33,6 @@ PER_TICK: Final = 2
 """Evaluations in a tick by default: 8 ms of the 50 ms between two ticks."""
 CERTAINTY: Final = 0.9
 """Probability by default with which all must be as it seems that a plan rests on."""
-MOST_EVALUATIONS: Final = 10_000
-"""Evaluations of a search at most."""
 _NO_KEY: Final = -1
 _OWN: Final = 6
 """Arrays of the memory before those of the planner alone."""

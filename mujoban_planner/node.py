@@ -17,7 +17,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
-from mujoban_planner.lookahead import MOST_EVALUATIONS, look_ahead
+from mujoban_planner import MOST_EVALUATIONS
 
 
 class PlannerNode(ModuleNode[Planner]):
@@ -50,7 +50,11 @@ class PlannerNode(ModuleNode[Planner]):
         if self._look_ahead is None:
             about = described("evaluations of a search ahead; 0: none", fixed=True, low=0, high=MOST_EVALUATIONS)
             self._look_ahead = declare(self, "look_ahead", 0, about)
-        return look_ahead(module, self._look_ahead or 0)
+        if not self._look_ahead:
+            return module
+        from mujoban_planner.lookahead import look_ahead  # imports PyTorch, which not every planner needs
+
+        return look_ahead(module, self._look_ahead)
 
     @property
     def scout(self) -> Scout:

@@ -59,7 +59,7 @@ PARAMETERS: Final[dict[str, tuple[Any, ParameterDescriptor]]] = {
     "body": (BALL.name, _setting(f"the robot's body: {' or '.join(BODIES)}")),
     "world": (DEFAULT_WORLD, _setting(f"the physical world: {_WORLDS}")),
     "realtime": (0.0, _setting("simulated seconds per second; 0: lockstep", 0.0, FASTEST)),
-    "resend_after": (0.5, _setting("seconds without an answer until a tick is offered again", 0.01, 3600.0)),
+    "resend_after": (0.2, _setting("seconds without an answer until a tick is offered again", 0.01, 3600.0)),
     "await_recorder": (False, _setting("whether in lockstep a recorder must have written a tick before the next")),
     "await_monitor": (False, _setting("whether in lockstep a monitor must have heard a tick before the next")),
     "instructed": (True, _setting("whether torques follow instructions, which a tick then awaits as well")),

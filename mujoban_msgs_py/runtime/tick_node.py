@@ -43,7 +43,7 @@ from mujoban_msgs_py.topics import EPISODE, QUEUE_DEPTH, Message, Topic
 
 _DEADLINE = 3600.0
 """Seconds after which a wait begins anew."""
-PATIENCE = 20
+PATIENCE = 60
 """Repeated offers of a tick after which a node answers without what it still waits for: one that was killed is back by
 then, and has said it."""
 
