@@ -26,9 +26,9 @@ from mujoban_sokoban.episodes import Episodes
 class Options:
     """What is measured."""
 
-    ticks: int = 300
+    ticks: int = 150
     """Of each contestant in a round."""
-    rounds: int = 5
+    rounds: int = 12
     difficulty: int = 5
     seed: int = 0
     oracle: tuple[str, ...] = ()
