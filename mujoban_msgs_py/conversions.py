@@ -128,12 +128,9 @@ def proprio_to_msg(header: Header, proprio: ArrayLike, joints: Sequence[str]) ->
         position=array("d", values[part.joint_position]),
         velocity=array("d", values[part.joint_velocity]),
     )
-    for vector, where in (
-        (message.linear_velocity, part.linear_velocity),
-        (message.angular_velocity, part.angular_velocity),
-        (message.linear_acceleration, part.linear_acceleration),
-        (message.world_z_axis, part.up_axis),
-    ):
+    parts = (part.linear_velocity, part.angular_velocity, part.linear_acceleration, part.up_axis)
+    for name, where in zip((*_INERTIAL, "world_z_axis"), parts, strict=True):
+        vector = getattr(message, name)
         vector.x, vector.y, vector.z = values[where]
     return message
 
@@ -164,9 +161,8 @@ def pose_to_msg(header: Header, pose: ArrayLike) -> PoseStamped:
     """Return a pose (x [m], y [m], psi [rad]), [3]; psi in [-pi, pi]."""
     x, y, yaw = _finite("pose", pose, (3,), np.float64).tolist()
     message = PoseStamped(header=header)
-    position, orientation = message.pose.position, message.pose.orientation
-    position.x, position.y = x, y
-    orientation.z, orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+    p, q = message.pose.position, message.pose.orientation
+    p.x, p.y, q.z, q.w = x, y, math.sin(yaw / 2), math.cos(yaw / 2)
     return message
 
 
