@@ -84,7 +84,7 @@ class SimulatorNode(EndingNode):
         realtime: Simulated seconds per second; 0 is lockstep.
         resend_after: Seconds without an answer after which a tick is offered again in lockstep.
         await_recorder: Whether in lockstep a recorder must have acknowledged a tick before the next.
-        await_monitor: The same of the monitor. Who is in another process may hear this node later than it is heard.
+        await_monitor: The same of the monitor. In real time either is awaited in the first tick alone.
         instructed: Whether instructions come with the torques; those who play without modules send torques alone.
         top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
         resume_file: Where the node keeps every tick that it offers, so that it goes on from there after it was killed;
