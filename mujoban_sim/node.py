@@ -83,8 +83,7 @@ class SimulatorNode(EndingNode):
         world: The physical world, see `mujoban_sim.presets`.
         realtime: Simulated seconds per second; 0 is lockstep.
         resend_after: Seconds without an answer after which a tick is offered again in lockstep.
-        await_recorder: Whether in lockstep a recorder must have acknowledged a tick before the next.
-        await_monitor: The same of the monitor. In real time either is awaited in the first tick alone.
+        await_recorder, await_monitor: Whether a tick, in real time the first, waits until that one has acknowledged it.
         instructed: Whether instructions come with the torques; those who play without modules send torques alone.
         top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
         resume_file: Where the node keeps every tick that it offers, so that it goes on from there after it was killed;
@@ -275,8 +274,8 @@ class SimulatorNode(EndingNode):
         now = time.perf_counter()
         if self._over:
             return
-        self._clock_runs = self._clock_runs or self._answered
         if not (self._clock_runs and self._may_step()):
+            self._clock_runs = self._clock_runs or self._answered
             self._pace.start(now)
             return
         if (complaint := self._pace.complaint(now)) is not None:

@@ -278,6 +278,11 @@ def test_real_time_keeps_to_the_clock(play_graph):
     assert time.monotonic() - start >= 0.9 * seconds
 
 
+def test_real_time_that_is_kept_is_not_complained_of_when_the_clock_starts(play_graph, capfd):
+    play_graph(realtime=0.25, time_limit=2).finish()
+    assert "not kept" not in capfd.readouterr().err
+
+
 def test_weights_are_loaded_while_the_graph_runs_and_bad_ones_are_refused(play_graph, oracles, fresh_weights, tmp_path):
     stack = Stack(oracles.choices | {"estimator": fresh_weights.choices["estimator"]})
     graph = play_graph(stack, time_limit=2000)
