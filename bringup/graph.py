@@ -97,8 +97,7 @@ class InProcess:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         """Stop all nodes."""
         for node in (*self._others, *self.nodes.values()):
-            self.executor.remove_node(node)
-            node.destroy_node()
+            self._remove(node)
         self.executor.shutdown()
 
     def start(self, name: str) -> None:
@@ -109,9 +108,7 @@ class InProcess:
 
     def stop(self, name: str) -> None:
         """End a node of the graph, at once and without a word."""
-        node = self.nodes.pop(name)
-        self.executor.remove_node(node)
-        node.destroy_node()
+        self._remove(self.nodes.pop(name))
 
     def add(self, node: NodeT) -> NodeT:
         """Run another node on the executor, and end it with the graph."""
@@ -122,6 +119,9 @@ class InProcess:
     def end(self, node: Node) -> None:
         """End a node that `add` has been given."""
         self._others.remove(node)
+        self._remove(node)
+
+    def _remove(self, node: Node) -> None:
         self.executor.remove_node(node)
         node.destroy_node()
 
