@@ -117,7 +117,9 @@ def copy_repository(folder: Path, fresh: bool) -> None:
         return
     shutil.copytree(ROOT / "mujoban_msgs", folder / "mujoban_msgs", dirs_exist_ok=True)
     for compiled in (p for package in ROOT.glob("*/__init__.py") for p in package.parent.rglob("__pycache__")):
-        shutil.copytree(compiled, folder / compiled.relative_to(ROOT), dirs_exist_ok=True)
+        # What another process is just writing is gone a moment later.
+        unfinished = shutil.ignore_patterns("*.tmp.*", "*.pyc.*")
+        shutil.copytree(compiled, folder / compiled.relative_to(ROOT), ignore=unfinished, dirs_exist_ok=True)
     (folder / ".venv").mkdir()
     for part in Path(sys.prefix).iterdir():
         (folder / ".venv" / part.name).symlink_to(part)
