@@ -165,7 +165,7 @@ def test_every_node_says_on_diagnostics_how_it_is(play_graph):
 
 
 def test_processes_that_are_killed_are_started_again(ros, oracles):
-    episodes = Episodes(1, 0, difficulty=1)
+    episodes = Episodes(1, 0, difficulty=2)
     parameters = graph_parameters(oracles, episodes)
     with InProcess(parameters, ()) as graph, Processes(parameters) as processes:
         monitor = graph.add(MonitorNode(episodes))
