@@ -73,7 +73,7 @@ class SimulatorNode(EndingNode):
     """Plays episodes, in lockstep with the graph or in real time.
 
     In lockstep the world steps when the torque and the instruction of the current stamp have arrived, so a run
-    is deterministic. In real time it steps when the clock says so, and holds the latest torque.
+    is deterministic. In real time it steps when the clock says so, and holds the latest torque for a while.
 
     Parameters:
         seed, episodes, difficulty, level_file: Which episodes are played, see `mujoban_sokoban.episodes.Episodes`;
@@ -82,7 +82,7 @@ class SimulatorNode(EndingNode):
         body: The robot's body.
         world: The physical world, see `mujoban_sim.presets`.
         realtime: Simulated seconds per second; 0 is lockstep.
-        resend_after: Seconds without an answer after which a tick is offered again in lockstep.
+        resend_after: Seconds without an answer after which a tick is offered again; in real time the clock then waits.
         await_recorder, await_monitor: Whether a tick, in real time the first, waits until that one has acknowledged it.
         instructed: Whether instructions come with the torques; those who play without modules send torques alone.
         top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
@@ -109,8 +109,7 @@ class SimulatorNode(EndingNode):
         """
         super().__init__("simulator", **options)
         self.counts: Counter[str] = Counter()
-        self.finished = Future()
-        self.ticks = 0
+        self.finished, self.ticks = Future(), 0
         self._settings: dict[str, Any] = {name: declare(self, name, *about) for name, about in PARAMETERS.items()}
         self.episodes = self._read_episodes()
         self.world = World(
@@ -132,7 +131,6 @@ class SimulatorNode(EndingNode):
         awaited = {"await_recorder": topics.RECORDED, "await_monitor": topics.MONITORED}
         self._witnesses = [topic for name, topic in awaited.items() if self._settings[name]]
         self._unconfirmed: set[Topic] = set()
-        self._clock_runs = False  # in real time, from when the first tick has been answered
         self._paused = False
         self._steps_due = 0
         self._started: float | None = None
@@ -141,7 +139,7 @@ class SimulatorNode(EndingNode):
         self._resumed = self._restore()
         # What is missing to draw with shows now, and the first tick is as quick as the others.
         self.world.render()
-        self._pace = Pace(self._speed)
+        self._pace = Pace(self._speed, patience=self._settings["resend_after"])
         self._listen()
         report_on(self, self._condition)
         self._start_timer = self.create_timer(MATCH_PERIOD, self._start_when_complete)
@@ -243,7 +241,7 @@ class SimulatorNode(EndingNode):
     def _offer_again(self) -> None:
         """Repeat a tick that stays without an answer: a node may have been started since."""
         waited = time.perf_counter() - self._offered > self._settings["resend_after"]
-        if waited and not (self._answered or self._over or self._clock_runs):
+        if waited and not (self._answered or self._over or self._pace.running):
             self.counts["repeated ticks"] += 1
             self._publish()
 
@@ -274,8 +272,9 @@ class SimulatorNode(EndingNode):
         now = time.perf_counter()
         if self._over:
             return
-        if not (self._clock_runs and self._may_step()):
-            self._clock_runs = self._clock_runs or self._answered
+        if self._pace.falls_silent(now, answered=self._answered):
+            self._reject("waits of the clock", f"no torque for {self._pace.patience} s: the clock waits for one")
+        if not (self._pace.running and self._may_step()):
             self._pace.start(now)
             return
         if (complaint := self._pace.complaint(now)) is not None:
@@ -320,6 +319,7 @@ class SimulatorNode(EndingNode):
     def _on_torque(self, message: Received) -> None:
         if not self._is_known(message.stamp, topics.TORQUE.name):
             return
+        self._pace.heard = time.perf_counter()
         if message.stamp == self._stamp:
             self._torque = message.content
             self._proceed()

@@ -1,4 +1,4 @@
-"""Whether real time is kept: how fast simulated time goes, and how many answers come late."""
+"""The clock of real time: whether it runs, how fast simulated time goes, and how many answers come late."""
 
 from __future__ import annotations
 
@@ -21,12 +21,34 @@ class Pace:
 
     speed: float
     """Simulated seconds per second that are wanted; 0 is lockstep, which keeps to no clock."""
+    patience: float
+    """Seconds without an answer after which the clock waits: a robot must not drive on without a driver."""
+    running: bool = False
+    """Whether the clock runs; it starts with the first tick that was answered."""
+    heard: float = 0.0
+    """When the last answer came, to this tick or to one before."""
     ticks: int = 0
     """In the window so far."""
     late: int = 0
     """Ticks of the window without a torque of their own."""
     _since: float = 0.0
     _kept: bool = True
+
+    def falls_silent(self, now: float, *, answered: bool) -> bool:
+        """Start the clock when a tick has been answered; stop it, and return True, when no answers come any more.
+
+        Args:
+            now: Seconds of a clock that never jumps.
+            answered: Whether everybody has answered the tick that is open.
+        """
+        if answered:
+            if not self.running:
+                self.start(now)
+            self.running, self.heard = True, now
+        elif self.running and now - self.heard > self.patience:
+            self.running = self._kept = False
+            return True
+        return False
 
     def start(self, now: float) -> None:
         """Begin a window, as after a pause; `now` in seconds of a clock that never jumps."""
@@ -39,7 +61,7 @@ class Pace:
 
     @property
     def kept(self) -> bool:
-        """Whether real time was kept in the last window."""
+        """Whether real time was kept in the last window, and the clock has not stopped since."""
         return self._kept
 
     def complaint(self, now: float) -> str | None:

@@ -11,7 +11,7 @@ def play(pace, start, rate, late=0.0):
 
 
 def test_a_slow_world_and_late_answers_are_complained_about_while_they_happen():
-    pace = Pace(2.0)
+    pace = Pace(2.0, patience=0.2)
     assert play(pace, 0.0, 40) is None and pace.kept
     assert "12.0 of 40.0 ticks/s" in play(pace, 10.0, 12) and not pace.kept
     assert "30 % of the answers late" in play(pace, 20.0, 40, late=0.3)
@@ -20,4 +20,18 @@ def test_a_slow_world_and_late_answers_are_complained_about_while_they_happen():
 
 
 def test_lockstep_keeps_to_no_clock():
-    assert play(Pace(0.0), 0.0, 1) is None
+    assert play(Pace(0.0, patience=0.2), 0.0, 1) is None
+
+
+def test_the_clock_runs_while_answers_come_to_whatever_tick_and_waits_for_an_answer_once_they_do_not():
+    pace = Pace(1.0, patience=0.2)
+    assert not pace.falls_silent(9.0, answered=False) and not pace.running, "it starts with an answer"
+    assert not pace.falls_silent(10.0, answered=True) and pace.running
+    pace.heard = 10.15
+    assert not pace.falls_silent(10.3, answered=False) and pace.running, "an answer to an earlier tick came"
+    assert pace.falls_silent(10.4, answered=False) and not pace.running and not pace.kept
+    assert not pace.falls_silent(10.5, answered=False), "said once"
+    pace.heard = 10.55
+    assert not pace.falls_silent(10.6, answered=False) and not pace.running, "it was to another tick"
+    assert not pace.falls_silent(10.7, answered=True) and pace.running
+    assert pace.complaint(10.8) is None, "the time without a clock counts as time that was not kept"
