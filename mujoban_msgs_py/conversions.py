@@ -33,6 +33,7 @@ from mujoban_msgs_py.topics import Message
 ENCODING: Final = "rgb8"
 _SECOND: Final = 1_000_000_000
 _ROUNDED_PI: Final = float(np.float32(math.pi))
+_LARGEST: Final[dict[type[np.floating[Any]], float]] = {t: float(np.finfo(t).max) for t in (np.float32, np.float64)}
 _INERTIAL: Final = ("linear_velocity", "angular_velocity", "linear_acceleration")
 
 
@@ -361,17 +362,16 @@ def episode_truth_from_msg(message: EpisodeTruth) -> EpisodeTruthReading:
 
 def _finite(what: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
     """Return values as an array after a check of shape (None: any length) and finiteness."""
-    with np.errstate(over="ignore"):
-        # What has no place in the type becomes infinite, which is refused below.
-        result = np.asarray(values, dtype)
+    result = np.asarray(values, np.float64)
     if len(result.shape) != len(shape) or any(
         want not in (None, have) for want, have in zip(shape, result.shape, strict=True)
     ):
         expected = ", ".join("any" if n is None else str(n) for n in shape)
         raise ConversionError(f"{what} must have shape [{expected}], got {list(result.shape)}")
-    if not np.isfinite(result).all():
+    # Written so that NaN fails as well, and what has no place in the type.
+    if not (np.abs(result) <= _LARGEST[dtype]).all():
         raise ConversionError(f"{what} must be finite, got {result.tolist()}")
-    return result
+    return result.astype(dtype, copy=False)
 
 
 def _torque(values: ArrayLike, size: int | None) -> NDArray[np.float32]:
