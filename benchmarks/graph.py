@@ -26,9 +26,9 @@ from mujoban_sokoban.episodes import Episodes
 class Options:
     """What is measured."""
 
-    ticks: int = 150
+    ticks: int = 75
     """Of each contestant in a round."""
-    rounds: int = 12
+    rounds: int = 32
     difficulty: int = 5
     seed: int = 0
     oracle: tuple[str, ...] = ()
