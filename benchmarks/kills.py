@@ -27,6 +27,8 @@ from bringup.results import EpisodeResult
 from bringup.stack import PlayOptions, play
 from mujoban_core.plugins import ROLES
 from mujoban_core.signals import StopSignal
+from mujoban_msgs_py import topics
+from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.tick_node import init_ros, spin
 from mujoban_sokoban.episodes import Episodes
 
@@ -74,7 +76,14 @@ class Killer:
         self._waiting = [node for _ in range(options.kills) for node in options.nodes]
         self.still: dict[str, list[float]] = {node: [] for node in options.nodes}
         self._due = _BETWEEN[1]
-        self._killed: tuple[str, float, int, int] | None = None
+        self._torques, self._torque = 0, -1
+        self._killed: tuple[str, float, int, int, int] | None = None
+        listen(monitor, topics.TORQUE, self._on_torque)
+
+    def _on_torque(self, message: Received) -> None:
+        """Count what the controller says, which the monitor does not wait for."""
+        if message.stamp > self._torque:
+            self._torques, self._torque = self._torques + 1, message.stamp
 
     def look(self) -> None:
         """Kill the next node, or see whether the graph has recovered from the last kill."""
@@ -83,11 +92,11 @@ class Killer:
             if self._waiting and ticks >= self._due:
                 node = self._waiting.pop(0)
                 self._processes.kill(node, signal.SIGKILL)
-                self._killed = node, now, ticks, self._processes.restarts[node]
+                self._killed = node, now, ticks, self._torques, self._processes.restarts[node]
             return
-        node, since, before, restarts = self._killed
+        node, since, before, torques, restarts = self._killed
         # One tick may have been on its way; the second is answered by the graph with the new process in it.
-        if self._processes.restarts[node] > restarts and ticks > before + 1:
+        if self._processes.restarts[node] > restarts and ticks > before + 1 and self._torques > torques + 1:
             self.still[node].append(now - since)
             self._killed = None
             self._due = ticks + int(self._rng.integers(*_BETWEEN))
