@@ -26,6 +26,7 @@ from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.samples import SampleBuffer, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import Teacher
+from mujoban_rl.precision import autocast
 from mujoban_rl.weights import save_weights
 from mujoban_sokoban.generator import generate_batch
 
@@ -90,7 +91,7 @@ def training_samples_per_second(config: ImitationConfig, options: Options) -> fl
 
     def step() -> None:
         batch = make_batch(buffer.draw(config.batch_size, rng), rng.integers(0, SYMMETRIES, config.batch_size))
-        with torch.autocast(torch.device(options.device).type, torch.bfloat16):
+        with autocast(options.device):
             loss, _ = imitation_loss(network, batch.to(options.device), config)
         adam.zero_grad()
         loss.backward()

@@ -26,6 +26,7 @@ from mujoban_estimator.termination import ControlTermination, TerminationConfig,
 from mujoban_rl.engine import Learner, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step
+from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import load_weights, save_weights
 
@@ -198,7 +199,7 @@ class EstimatorLearner(Learner[Batch]):
         felt = (windows.stream[:, None] * ticks + windows.tick).ravel()
         # Frames that both look at are encoded once.
         frames, place = np.unique(np.concatenate([seen, felt]), return_inverse=True)
-        with torch.autocast(self.device.type, torch.bfloat16):
+        with autocast(self.device):
             encoded = self.estimator.encoder(self._tensor(batch.frame.reshape(-1, *batch.frame.shape[2:])[frames]))
             features = encoded[torch.from_numpy(place).to(self.device)]
             mapped, parts = self._estimator_loss(features[: len(seen)], batch, updates)
@@ -211,7 +212,8 @@ class EstimatorLearner(Learner[Batch]):
         streams = len(batch.valid)
         output = self.estimator(features.unflatten(0, (streams, -1)), batch.pose[:, updates], self._belief)
         # Truncated back-propagation through time: the belief goes on, its gradient does not.
-        self._belief = Belief(*(b.detach() for b in output.belief))
+        # In the layout that a checkpoint restores, by which convolutions choose their order of additions.
+        self._belief = Belief(*(b.detach().contiguous() for b in output.belief))
         views = Views(self._tensor(batch.in_view[:, updates]), self._tensor(batch.seen[:, updates]))
         return estimator_loss(
             output, self._tensor(batch.abstract_state[:, updates]), views,

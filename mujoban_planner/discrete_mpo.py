@@ -24,6 +24,7 @@ from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
 from mujoban_rl.losses.returns import windowed_returns
 from mujoban_rl.optimise import guarded_step
+from mujoban_rl.precision import autocast
 from mujoban_rl.replay import SequenceReplay
 
 _CLIP: Final = 40.0
@@ -156,10 +157,10 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
     def update(self, batch: MPOBatch, progress: float, guard: NaNGuard) -> dict[str, float]:
         """Take one gradient step of policy, critic and dual variables."""
         config, batch = self.config, batch.to(self.device)
-        with torch.no_grad(), self._autocast():
+        with torch.no_grad(), autocast(self.device):
             before, after = self._answers(self.target, batch.state), self._answers(self.target, batch.last)
         target = batch.reward + batch.bootstrap * self.value(after)
-        with self._autocast():
+        with autocast(self.device):
             output = self._answers(self.network, batch.state)
         policy_loss, stats = self.mpo(output.policy, before.policy, before.q)
         if self._updates < config.critic_first:
@@ -178,9 +179,6 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
     def value(self, answer: Answer) -> Tensor:
         """Return what states are worth, [B]."""
         return expected_value(answer.q, answer.policy)
-
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast(self.device.type, torch.bfloat16)
 
     def weights(self) -> Mapping[str, Tensor]:
         """Return the online network, which actors play with."""

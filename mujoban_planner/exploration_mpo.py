@@ -28,6 +28,7 @@ from mujoban_planner.validation import difficulty_shares, validation_levels
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.losses.mpo_discrete import DiscreteMPOConfig
+from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import provenance, save_weights
 
@@ -92,7 +93,7 @@ class ExplorerActor(SequenceActor):
 
     def _step(self) -> tuple[dict[str, NDArray[Any]], dict[str, list[float]]]:
         state = self._environment.observe()
-        with torch.autocast("cpu", torch.bfloat16):
+        with autocast("cpu"):
             policy = self._explorer(torch.from_numpy(state)).policy
         action = self._choose(policy.float()).numpy()
         step = self._environment.step(action)

@@ -27,6 +27,7 @@ from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
+from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import origin, provenance, save_weights
 
@@ -120,7 +121,7 @@ class ImitationLearner(Learner[Batch]):
     """Trains a network on lessons; the moving average of its weights is what is played and shipped."""
 
     def __init__(self, config: LearnerConfig, device: torch.device | str = "cpu") -> None:
-        """Make the network; on a CPU it trains in bfloat16."""
+        """Make the network."""
         self.config, self.device = config, torch.device(device)
         torch.manual_seed(config.seed)  # the initial weights
         self.network = config.build().to(self.device)
@@ -151,7 +152,7 @@ class ImitationLearner(Learner[Batch]):
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> dict[str, float]:
         """Take one gradient step; return the parts of the loss."""
         self._schedule.follow(progress)
-        with torch.autocast(self.device.type, torch.bfloat16):
+        with autocast(self.device):
             loss, parts = imitation_loss(self.network, batch.to(self.device), self.config)
         if guarded_step(loss, [self.optimiser], guard, clip=_CLIP) is not None:
             self._average.update_parameters(self.network)
@@ -164,7 +165,7 @@ class ImitationLearner(Learner[Batch]):
 
     def evaluate(self) -> dict[str, float]:
         """Return solve rates of the average on held-out levels."""
-        return success_rates(self.average, reduced_precision=self.device.type == "cpu")
+        return success_rates(self.average)
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the average with its record."""

@@ -15,6 +15,7 @@ from mujoban_planner.play import Game, play
 from mujoban_planner.samples import Samples, concatenate, make_batch
 from mujoban_planner.teacher import Teacher, label_deadly, possible_pushes
 from mujoban_rl.engine import State
+from mujoban_rl.precision import autocast
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 from mujoban_sokoban.levels import LevelBatch
 from mujoban_sokoban.solver import Status
@@ -184,7 +185,7 @@ def errs(planner: LearnedPlanner, samples: Samples) -> NDArray[np.bool_]:
     for start in range(0, n, _FORWARD):
         rows = np.arange(start, min(start + _FORWARD, n))
         batch = make_batch(samples.take(rows), np.zeros(len(rows), np.int64))
-        with torch.autocast("cpu", torch.bfloat16):
+        with autocast("cpu"):
             output = planner(batch.state)
         wrong = batch.right.any(1) & ~batch.right.gather(1, output.policy.argmax(1, keepdim=True))[:, 0]
         wrong |= _misjudged(output.dead, batch.dead, batch.dead_known)

@@ -24,6 +24,7 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.validation import Shares, difficulty_shares
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
+from mujoban_rl.precision import autocast
 from mujoban_rl.replay import SequenceBuilder
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 
@@ -190,7 +191,7 @@ class MoveActor(SequenceActor):
 
     def _step(self) -> tuple[dict[str, Tensor], dict[str, list[float]]]:
         state = self._environment.observe()
-        with torch.autocast(self._device.type, torch.bfloat16):
+        with autocast(self._device):
             policy = self._planner(state).policy
         instruction = self._choose(policy).to(self._device)
         step = self._environment.step(instruction)

@@ -5,16 +5,15 @@ Shapes: B levels, K boxes, N = `grid.GRID_SIZE`, T decisions at most.
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mujoban_core.interfaces import Planner, put_rows, take_rows
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import abstract_states, take_levels
+from mujoban_rl.precision import autocast
 from mujoban_sokoban import rules
 from mujoban_sokoban.levels import LevelBatch
 
@@ -56,7 +55,7 @@ def play(
         limit: T.
         exploration: Probability of a random move in place of the decision; needs `rng`.
         rng: Source of exploration.
-        reduced_precision: Run a network in bfloat16, which pays for large batches.
+        reduced_precision: Run a network in bfloat16, where that pays for large batches.
     """
     batch = len(levels.player)
     moves = np.full(batch, -1, np.int64)
@@ -66,9 +65,8 @@ def play(
     active = np.arange(batch)
     memory = planner.initial_state(np.zeros(batch, np.int64)).memory
     decisions = 0
-    autocast = torch.autocast("cpu", torch.bfloat16) if reduced_precision else nullcontext()
     for t in range(limit):
-        with autocast:
+        with autocast("cpu", enabled=reduced_precision):
             decision, after = planner.decide(abstract_states(levels), take_rows(memory, active))
         memory = put_rows(memory, active, after)
         decisions += len(active)

@@ -22,6 +22,7 @@ from mujoban_planner.training_levels import Ticket, TrainingLevels
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
+from mujoban_rl.precision import autocast
 
 BOARDS = BitBoards._fields
 
@@ -72,7 +73,7 @@ class PushActor(Actor):
         seen: dict[str, list[NDArray[Any]]] = {name: [] for name in (*BOARDS, "push", "reward", "over", "log_prob")}
         statistics: dict[str, list[float]] = {f"solved/{d}": [] for d in DIFFICULTIES} | {"moves_per_push": []}
         for _ in range(config.steps):
-            with torch.autocast("cpu", torch.bfloat16):
+            with autocast("cpu"):
                 log_policy = self.policy(environment.boards).logits.log_softmax(1)
             push = torch.multinomial(log_policy.exp(), 1, generator=self._generator)
             before = {name: column.copy() for name, column in environment.boards._asdict().items()}

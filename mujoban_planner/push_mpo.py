@@ -32,6 +32,7 @@ from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
 from mujoban_rl.losses.returns import windowed_returns
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
+from mujoban_rl.precision import autocast
 from mujoban_rl.replay import SequenceBuilder, SequenceReplay
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
@@ -116,10 +117,10 @@ class PushMPOLearner(Learner[Window]):
         rows = torch.arange(len(over))
         symmetry = self._rng.integers(0, SYMMETRIES, len(over))
         first, last = (_boards(batch, rows, at) for at in (torch.zeros_like(rows), returns.index))
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        with torch.no_grad(), autocast("cpu"):
             before, after = self.target(first, symmetry), self.target(last, symmetry)
         goal = returns.reward + returns.bootstrap * expected_value(after.q, after.logits)
-        with torch.autocast("cpu", torch.bfloat16):
+        with autocast("cpu"):
             output = self.policy(first, symmetry)
         policy_loss, stats = self.mpo(output.logits, before.logits, before.q)
         taken = output.q.gather(1, images(batch["push"][:, 0].numpy(), symmetry)[:, None])[:, 0]
@@ -135,7 +136,7 @@ class PushMPOLearner(Learner[Window]):
 
     def evaluate(self) -> Scalars:
         """Return the averaged planner's solve rates, alone, on held-out levels."""
-        return success_rates(self.target.planner, reduced_precision=True)
+        return success_rates(self.target.planner)
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the averaged planner's weights with their record."""

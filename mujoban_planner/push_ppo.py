@@ -25,6 +25,7 @@ from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.ppo import PPOConfig, generalised_advantages, ppo_loss
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_cosine
+from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
 
@@ -90,7 +91,7 @@ class PushPPOLearner(Learner[Arrays]):
             order = self._rng.permutation(len(push))
             for rows in np.array_split(order, max(1, len(push) // config.minibatch)):
                 states = BitBoards._make(column[rows] for column in boards)
-                with torch.autocast("cpu", torch.bfloat16):
+                with autocast("cpu"):
                     output = self.policy(states)
                 # What is not finite goes through, for the guard to see.
                 policy = Categorical(logits=output.logits, validate_args=False)
@@ -106,7 +107,7 @@ class PushPPOLearner(Learner[Arrays]):
         """Return normalised advantages and targets of values, [T * E]."""
         length, levels = batch["reward"].shape
         boards = BitBoards._make(np.concatenate([batch[name], batch[f"last_{name}"][None]]).ravel() for name in BOARDS)
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        with torch.no_grad(), autocast("cpu"):
             value = self.policy(boards).value.view(length + 1, levels)
         reward, over = (torch.from_numpy(batch[name].copy()) for name in ("reward", "over"))
         discount = self.config.discount * (~over).float()
@@ -121,7 +122,7 @@ class PushPPOLearner(Learner[Arrays]):
     def evaluate(self) -> Scalars:
         """Return the planner's solve rates, alone, on held-out levels."""
         planner = self.policy.planner.eval()
-        rates = success_rates(planner, reduced_precision=True)
+        rates = success_rates(planner)
         planner.train()
         return rates
 

@@ -115,7 +115,7 @@ class MPOLearner(DiscreteMPOLearner):
 
     def evaluate(self) -> dict[str, float]:
         """Return solve rates of the target network on held-out levels."""
-        return success_rates(self.target, reduced_precision=self.device.type == "cpu")
+        return success_rates(self.target)
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the target network with its record."""

@@ -33,6 +33,7 @@ from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
+from mujoban_rl.precision import autocast
 from mujoban_sokoban.solver import label_solutions
 
 _LONG: Final = 15
@@ -156,7 +157,7 @@ class SearchActor(Actor):
             led = (self._rng.random(len(over)) < config.led) * self._rng.integers(1, config.lead + 1, len(over))
             for row, ticket, pushes in zip(over.tolist(), tickets, led.tolist(), strict=True):
                 self._tickets[row], self._leads[row] = ticket, _Lead(0 if ticket.failures else pushes)
-        with torch.autocast("cpu", torch.bfloat16):
+        with autocast("cpu"):
             grow(forest, np.arange(config.trees), self.planner)
         for row, lead in enumerate(self._leads):
             if lead.pushes_left:

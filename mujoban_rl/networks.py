@@ -15,14 +15,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_core.camera import FRAME_SIZE, CameraMount, project
+from mujoban_rl.precision import autocast
 
 MIN_SCALE: Final = 1e-3
 """Smallest standard deviation of a torque."""
 INITIAL_SCALE: Final = 0.5
 """Standard deviation of every torque before training."""
 _CLIP: Final = 5.0
-_BFLOAT16: Final = ("amx_bf16", "avx512_bf16", "bf16")
-"""Instructions for bfloat16 as `torch.cpu.get_capabilities` names them, of x86 and of ARM."""
 
 
 class Gaussian(NamedTuple):
@@ -48,17 +47,6 @@ class Gaussian(NamedTuple):
         return torch.where(action.abs() < 1.0, normal.log_prob(action), beyond).sum(-1)
 
 
-def bfloat16_pays(device: torch.device) -> bool:
-    """Return whether a device computes in bfloat16 faster than in float32.
-
-    All that CUDA runs on do; a CPU without instructions for it takes 2.6 times as long.
-    """
-    if device.type != "cpu":
-        return True
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # not in torch 2.11
-    return any(capabilities.get(name, False) for name in _BFLOAT16)
-
-
 def encode_frames(encoder: nn.Module, frame: Tensor, dtype: torch.dtype, *, mixed_precision: bool) -> Tensor:
     """Return the features [M, F] that a ResNet finds in frames uint8 [M, rows, columns, 3].
 
@@ -66,12 +54,11 @@ def encode_frames(encoder: nn.Module, frame: Tensor, dtype: torch.dtype, *, mixe
         encoder: The ResNet.
         frame: Pictures.
         dtype: Of the features.
-        mixed_precision: Whether the ResNet computes in bfloat16, where `bfloat16_pays`.
+        mixed_precision: Whether the ResNet computes in bfloat16, where that pays.
     """
     # A permuted NHWC tensor is channels_last already.
     x = frame.permute(0, 3, 1, 2).to(dtype) / 255.0 - 0.5
-    enabled = mixed_precision and bfloat16_pays(frame.device)
-    with torch.autocast(frame.device.type, torch.bfloat16, enabled=enabled):
+    with autocast(frame.device, enabled=mixed_precision):
         return encoder(x).to(dtype)
 
 
