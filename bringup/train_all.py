@@ -43,9 +43,9 @@ PRODUCTS: Final = {
 """And all that another stage needs: the teacher, its student, the planner of boards in full view, the bags."""
 _BAGS: Final = ("first", "second")
 SHARES: Final = {
-    "teacher": 0.05,
-    "controller_distil": 0.23,
-    "controller_mpo": 0.12,
+    "teacher": 0.09,
+    "controller_distil": 0.27,
+    "controller_mpo": 0.10,
     "planner": 0.40,
     "planner_views": 0.06,
     "bags_first": 0.03,
