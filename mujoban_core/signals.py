@@ -18,6 +18,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Final, NoReturn, Self
 
+from mujoban_core.worker import end_workers
+
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, a polite kill, a terminal that was closed."""
 _COMPILERS: Final = ("numba", "llvmlite")
@@ -65,6 +67,7 @@ def leave(status: int) -> NoReturn:
 
     The interpreter is not taken down in order: with PyTorch and ROS in it that takes seconds on a busy machine.
     """
+    end_workers()
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):  # a terminal that was closed, a pipe whose reader has left

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import threading
 import weakref
 from collections.abc import Callable
@@ -58,9 +57,13 @@ def _work(jobs: SimpleQueue[Callable[[], None] | None]) -> None:
 _WORKERS: weakref.WeakSet[Worker] = weakref.WeakSet()
 
 
-@atexit.register
-def _end_all() -> None:
+def end_workers() -> None:
     """Let what was submitted finish before the interpreter goes: a library must not be cut off in the middle."""
     for worker in list(_WORKERS):
         worker.end()
         worker.join()
+
+
+# Before what is registered with `atexit`, such as the end of EGL's display, which a painter may be opening just then;
+# as the pools of `concurrent.futures` do.
+threading._register_atexit(end_workers)  # pyright: ignore[reportAttributeAccessIssue]

@@ -46,3 +46,14 @@ def test_what_was_submitted_is_finished_before_the_interpreter_ends():
         " w.submit(lambda: (time.sleep(0.3), print('finished', flush=True)))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "finished\n"
+
+
+@pytest.mark.parametrize("end", ["", "from mujoban_core.signals import leave; leave(0)"])
+def test_workers_end_before_the_libraries_that_they_use(end):
+    code = (
+        "import atexit, time; from mujoban_core.worker import Worker; w = Worker('w');"
+        " w.submit(lambda: (atexit.register(print, 'library'), time.sleep(0.3), print('finished', flush=True)));"
+        f" time.sleep(0.1); {end}"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.stdout.split() == ["finished", "library"], ended.stderr
