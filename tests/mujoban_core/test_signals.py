@@ -14,6 +14,13 @@ from mujoban_core.program import exit_status
 from mujoban_core.signals import STOP_SIGNALS, Interrupted, StopSignal, interruptible, interruption
 
 
+@pytest.fixture(autouse=True)
+def _hangups_are_heard():
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores them, and so then do we
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_signal_asks_the_work_to_end_and_names_the_exit_status(number):
     before = signal.getsignal(number)
