@@ -9,7 +9,18 @@ from pathlib import Path
 
 from benchmarks.command import run_benchmark
 from benchmarks.paper import bodies, curves, figures, film, tables
-from benchmarks.paper.runs import ALL, CONFIGURATIONS, DIFFICULTY, RESULTS, SEED, Run, is_stale
+from benchmarks.paper.runs import (
+    ALL,
+    CONFIGURATIONS,
+    DIFFICULTY,
+    GRAPH,
+    LOOKING_AHEAD,
+    LOOKING_AROUND,
+    RESULTS,
+    SEED,
+    Run,
+    is_stale,
+)
 from mujoban_sim.rendering import RenderingError
 
 INTRODUCTION = f"""# Results
@@ -64,6 +75,11 @@ def rebuild(options: Options) -> str:
         tables.configurations(CONFIGURATIONS),
         "Why episodes fail:\n",
         tables.failures(CONFIGURATIONS),
+        "Beside these rows:\n",
+        tables.configurations((GRAPH, *LOOKING_AHEAD)),
+        tables.differences(CONFIGURATIONS[0], GRAPH),
+        "What says where to look before pushing:\n",
+        tables.configurations(LOOKING_AROUND),
         "## Figure 2: success against difficulty\n",
         tables.configurations(DIFFICULTY),
         tables.test_uses(ALL),

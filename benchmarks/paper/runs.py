@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from mujoban_core.bodies import BALL
 from mujoban_core.files import digest
-from mujoban_core.plugins import PRIVILEGED, ROLES, shipped_weights
+from mujoban_core.plugins import PRIVILEGED, ROLES, SCOUT, shipped_weights
 from mujoban_core.program import read_options, run_command
 from mujoban_sim.presets import DEFAULT_WORLD
 
@@ -28,6 +28,9 @@ EPISODES: Final = 512
 """Levels of an evaluation (paper C.5)."""
 DIGEST_LENGTH: Final = 64
 """Characters of a digest of weights; what is shorter names a class that stands in."""
+
+
+_LEARNED_SCOUT: Final = ("--scout", "learned")
 
 
 class ResultError(ValueError):
@@ -51,6 +54,8 @@ class Run:
     world: str = DEFAULT_WORLD
     controller: Path | None = None
     """Weights of the controller, where those of another body play."""
+    further: tuple[str, ...] = ()
+    """Further options of `bringup/evaluate.py`."""
 
     @property
     def file(self) -> Path:
@@ -62,6 +67,11 @@ class Run:
         """The command that reruns the evaluation."""
         return f"python -m benchmarks.paper.runs --only {self.name}"
 
+    def missing_weights(self) -> Path | None:
+        """Return where weights that are trained apart from the stack's should be and are not."""
+        apart = [self.agent, shipped_weights(SCOUT) if _LEARNED_SCOUT[0] in self.further else None]
+        return next((path for path in apart if path is not None and not path.is_file()), None)
+
     def options(self) -> list[str]:
         """Return the options of `bringup/evaluate.py` but for levels, seed and report."""
         oracle = ["--oracle", ",".join(self.oracle)] if self.oracle else []
@@ -69,7 +79,7 @@ class Run:
         body = [] if self.body == BALL.name else ["--body", self.body]
         world = [] if self.world == DEFAULT_WORLD else ["--world", self.world]
         controller = [] if self.controller is None else ["--controller", str(self.controller)]
-        return ["--difficulty", str(self.difficulty), *oracle, *agent, *body, *world, *controller]
+        return ["--difficulty", str(self.difficulty), *oracle, *agent, *body, *world, *controller, *self.further]
 
 
 SENSE: Final = ("estimator", "termination")
@@ -84,7 +94,25 @@ DIFFICULTY: Final = (
     CONFIGURATIONS[0],
 )
 """The points of Figure 2, difficulty 1 to 5."""
-ALL: Final = (*CONFIGURATIONS, *DIFFICULTY[:-1])
+GRAPH: Final = Run("graph", "default, through the ROS graph", further=("--graph",))
+"""The headline row as users run it."""
+_AHEAD: Final = ("--look-ahead", "400")
+LOOKING_AHEAD: Final = (
+    Run("default_ahead", "default, the planner looks ahead (400 evaluations)", further=_AHEAD),
+    Run(
+        "planner_controller_ahead", "planner + controller only, the planner looks ahead", oracle=SENSE, further=_AHEAD
+    ),
+)
+"""With a search over pushes before the planner decides, beside rows of Table 2."""
+LOOKING_AROUND: Final = (
+    Run("look_around_none", "none", further=("--look-around", "0")),
+    CONFIGURATIONS[0],
+    Run("look_around_learned", "learned", further=_LEARNED_SCOUT),
+)
+"""What says where to look before pushing: nothing, the rule that ships, a network."""
+ALL: Final = (
+    *CONFIGURATIONS, *DIFFICULTY[:-1], GRAPH, *LOOKING_AHEAD, *(run for run in LOOKING_AROUND if run.further),
+)  # fmt: skip
 
 
 def load(run: Run) -> dict[str, Any] | None:
@@ -169,8 +197,8 @@ def rerun(options: Options) -> None:
     for run in every:
         if run.name not in chosen:
             continue
-        if run.agent is not None and not run.agent.is_file():
-            print(f"{run.name}: no weights at {run.agent} yet (docs/baselines.md)", flush=True)
+        if (missing := run.missing_weights()) is not None:
+            print(f"{run.name}: no weights at {missing} yet", flush=True)
             continue
         if is_current(run, options.episodes) and not options.again:
             print(f"{run.name}: measured already with these weights (--again measures anew)", flush=True)

@@ -34,6 +34,22 @@ def failures(runs: Sequence[Run]) -> str:
     return _table(["configuration", *reasons], rows)
 
 
+def differences(one: Run, other: Run) -> str:
+    """Return in a sentence which levels ended otherwise in one run than in another; nothing while one is missing."""
+    reports = [load(run) for run in (one, other)]
+    if None in reports:
+        return ""
+    first, second = ({e["seed"]: e["solved"] for e in report["episodes"]} for report in reports if report)
+    shared = sorted(first.keys() & second.keys())
+    only = [[seed for seed in shared if a[seed] and not b[seed]] for a, b in ((first, second), (second, first))]
+    named = [", ".join(map(str, seeds)) or "none" for seeds in only]
+    return (
+        f"Of {len(shared)} levels, solved by `{one.name}` alone: {named[0]}; by `{other.name}` alone: {named[1]} "
+        "(seeds). Networks see batches of other sizes there, which changes the last bits of their answers, and "
+        "with them now and then a decision.\n"
+    )
+
+
 def test_uses(runs: Sequence[Run]) -> str:
     """Return how often the test levels were used for these rows, as their JSON has it."""
     uses = [report.get("test_uses") for report in map(load, runs) if report]

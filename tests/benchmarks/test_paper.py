@@ -35,7 +35,9 @@ def test_without_sources_the_page_names_the_commands_that_make_them(folder, caps
     page = (folder / "README.md").read_text()
     assert "python -m benchmarks.paper.runs --only film_strip" in page
     assert "python -m benchmarks.paper.curves --controller RUN" in page
-    assert page.count("not measured |") == 19, "one row of Table 1, three of Table 2, five of Figure 2, ten of Figure 5"
+    assert page.count("not measured |") == 25, (
+        "one row of Table 1, three of Table 2 and six beside, five of Figure 2, ten of Figure 5"
+    )
     assert "no source yet" in capsys.readouterr().err
 
 
@@ -49,6 +51,14 @@ def test_the_page_has_our_numbers_beside_the_papers_and_marks_other_weights(fold
     assert f"| controller only{tables.STALE} | `controller` |" in page and (folder / "figure2.png").stat().st_size
     assert runs.is_current(runs.CONFIGURATIONS[0], 4) and not runs.is_current(runs.CONFIGURATIONS[0], 512)
     assert not runs.is_current(runs.CONFIGURATIONS[2], 4)
+
+
+def test_levels_that_end_otherwise_through_the_graph_are_named(folder):
+    assert tables.differences(runs.CONFIGURATIONS[0], runs.GRAPH) == ""
+    write(runs.CONFIGURATIONS[0], 3, 4, {})
+    write(runs.GRAPH, 1, 4, {})
+    told = tables.differences(runs.CONFIGURATIONS[0], runs.GRAPH)
+    assert "Of 4 levels, solved by `default` alone: 1, 2; by `graph` alone: none (seeds)." in told
 
 
 def test_a_damaged_source_is_named_with_the_command_that_mends_it(folder):
