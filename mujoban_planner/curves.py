@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import matplotlib
 import tyro
@@ -18,6 +18,9 @@ from mujoban_core.files import check_file
 from mujoban_core.program import read_options, run_command
 
 PROG = "mujoban_planner.curves"
+
+_DRC: Final = ((10e6, 0.34), (20e6, 0.81), (50e6, 0.93), (100e6, 0.96), (2e9, 0.99))
+"""Moves of training and solve rate of DRC(3,3) on the unfiltered levels of Boxoban, by IMPALA (Guez et al. 2019)."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class Options:
     """Image to write."""
     difficulty: int = 5
     """Difficulty whose solve rate is drawn."""
+    published: bool = False
+    """Draw DRC(3,3) against its samples too, which are moves, on the unfiltered levels of Boxoban."""
 
 
 def read_curve(run: Path, difficulty: int) -> list[tuple[float, float, float]]:
@@ -70,6 +75,9 @@ def draw(curves: Mapping[str, Sequence[tuple[float, float, float]]], options: Op
     for name, curve in curves.items():
         for axis, column, scale in ((axes[0], 0, 1e3), (axes[1], 1, 60.0)):
             axis.plot([point[column] / scale for point in curve], [point[2] for point in curve], ".-", label=name)
+    if options.published:
+        moves, rates = zip(*_DRC, strict=True)
+        axes[0].plot([n / 1e3 for n in moves], rates, "x--", color="grey", label="DRC(3,3), published")
     axes[0].set(xlabel="thousand samples (logarithmic)", xscale="log")
     axes[0].set_ylabel(f"success rate, difficulty {options.difficulty}")
     axes[1].set(xlabel="CPU minutes of training")
