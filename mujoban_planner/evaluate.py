@@ -44,8 +44,8 @@ class Options:
     seed: int = VALIDATION_SEEDS.start
     """Seed of the first generated level; the next ones follow."""
     thinking: int | None = None
-    """Repeats of the recurrent core, relative to training, or symmetric views of the residual network, per decision;
-    the network's own by default."""
+    """Repeats, per decision, of the recurrent core, relative to training, or of a thinking network's last blocks, or
+    symmetric views of the residual network; the network's own by default."""
     caution: float | None = None
     """Weight of the verdicts on pushes in a decision; the planner's own by default."""
     look_ahead: bool = False

@@ -23,13 +23,15 @@ _POOLED = "inject.linear.weight"
 def start_from(network: LearnedPlanner, path: Path) -> None:
     """Give a network the weights of a trained planner that has the same or fewer channels and blocks.
 
+    One that repeats its last blocks may begin with those of one that does not.
+
     Raises:
         WeightsError: If the file is damaged, or its planner has another architecture, or more channels or blocks, or is
             a smaller recurrent one, whose gates cannot grow.
     """
     trained = load(path, compiled=False)
     ours, theirs = dict(network.named_parameters()), dict(trained.named_parameters())
-    fits = type(trained) is type(network) and all(k in ours and _holds(ours[k], v) for k, v in theirs.items())
+    fits = isinstance(network, type(trained)) and all(k in ours and _holds(ours[k], v) for k, v in theirs.items())
     if isinstance(network, RecurrentPlanner):
         fits = fits and all(ours[k].shape == v.shape for k, v in theirs.items())
     if not fits:

@@ -24,7 +24,7 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch
 from mujoban_planner.validation import NetworkConfig, success_rates
 from mujoban_rl.actors import ActorOptions
-from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
+from mujoban_rl.engine import Budget, Cadence, Learner, Source, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_rl.precision import autocast
@@ -33,6 +33,8 @@ from mujoban_rl.weights import origin, provenance, save_weights
 
 _CLIP = 1.0
 """Largest norm of the gradient."""
+_LONGEST = 70
+"""Moves that one generated level in a hundred takes, or fewer."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,16 @@ class LearnerConfig(NetworkConfig):
     """Weight of the dead-state head in the loss."""
     ema: float = 0.999
     """Decay of the averaged weights, which are what is played and shipped."""
+    thoughts: tuple[int, ...] = (1,)
+    """Thinking times, one for each batch in turns."""
     init: str | None = None
     """Weights to start from, where names and shapes agree."""
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Reject what is no thinking time."""
+        if not self.thoughts or min(self.thoughts) < 1:
+            raise ValueError(f"--thoughts {' '.join(map(str, self.thoughts))}: expected numbers from 1")
 
 
 @dataclass(frozen=True)
@@ -72,9 +81,14 @@ class ImitationConfig(LessonConfig, LearnerConfig):
     """Share of these decisions that are shown as they were estimated, the others as they were."""
 
     def __post_init__(self) -> None:
-        """Reject what is no share."""
+        """Reject what is no share, and levels that are hardly found."""
+        super().__post_init__()
         if not 0.0 < self.bag_share <= 1.0:
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
+        if not 0.0 <= self.long <= 1.0:
+            raise ValueError(f"--long {self.long}: expected a share, from 0 to 1")
+        if self.long_moves > _LONGEST:
+            raise ValueError(f"--long-moves {self.long_moves}: expected at most {_LONGEST}, as few levels take more")
 
 
 def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> tuple[Tensor, dict[str, Tensor]]:
@@ -133,6 +147,7 @@ class ImitationLearner(Learner[Batch]):
             self.network.parameters(), config.learning_rate, (0.9, 0.98), weight_decay=config.weight_decay, fused=True
         )
         self._schedule = ProgressSchedule(self.optimiser, warm_up_cosine(config.warm_up))
+        self._updates = 0
 
     @property
     def average(self) -> LearnedPlanner:
@@ -149,9 +164,20 @@ class ImitationLearner(Learner[Batch]):
         """One."""
         return {"adamw": self.optimiser}
 
+    def state(self) -> State:
+        """Return the number of updates."""
+        return State({"updates": self._updates})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._updates = state.values["updates"]
+
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> dict[str, float]:
         """Take one gradient step; return the parts of the loss."""
         self._schedule.follow(progress)
+        thoughts = self.config.thoughts
+        self.network.thinking = thoughts[self._updates % len(thoughts)]
+        self._updates += 1
         with autocast(self.device):
             loss, parts = imitation_loss(self.network, batch.to(self.device), self.config)
         if guarded_step(loss, [self.optimiser], guard, clip=_CLIP) is not None:

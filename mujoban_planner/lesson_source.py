@@ -45,6 +45,10 @@ class LessonConfig:
     """Share of a batch that shows only what the robot may have seen so far."""
     mix: Shares = (0.03, 0.04, 0.06, 0.12, 0.75)
     """Shares of difficulties 1 to 5 among the training levels."""
+    long: float = 0.0
+    """Share of the levels of difficulty 5 whose solution takes `long_moves` at least."""
+    long_moves: int = 45
+    """Of all levels of difficulty 5 one in eight takes so many."""
     levels: int = 256
     """Fresh levels of a lesson; the planner plays half as many before it is corrected."""
     stock: int = 800
@@ -72,7 +76,10 @@ class LessonActor(Actor):
         """
         self._config, self._planner = config, network.build().eval()
         self._planner.lay_out()
-        self._maker = LessonMaker(_STREAMS * config.seed + stream, difficulty_shares(config.mix), config.judged)
+        mix = difficulty_shares(config.mix)
+        self._maker = LessonMaker(
+            _STREAMS * config.seed + stream, mix, config.judged, long=config.long, long_moves=config.long_moves
+        )
         self._version = 0
         self._ahead = 0  # demonstrations less corrections, since there are any of these
 

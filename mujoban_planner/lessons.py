@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import join_levels, take_levels
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import Game, play
@@ -22,7 +24,8 @@ from mujoban_sokoban.solver import Status
 
 _WALK_SHARE: Final = 0.35
 """Share of walking states that is kept; pushes decide a level."""
-_PLAY_LIMIT: Final = 90
+_CANDIDATES: Final = 8
+"""Levels that are solved at once for each long one that is wanted: one in eight takes 45 moves."""
 _VISITS: Final = 4
 """States of each game from which the way is shown."""
 _KEPT: Final = 5
@@ -43,13 +46,17 @@ _SEEDS_PER_STREAM: Final = 10**12
 class LessonMaker:
     """Makes samples from fresh training levels; deterministic given its stream."""
 
-    def __init__(self, stream: int, mix: dict[int, float], judged: float = 1.0) -> None:
+    def __init__(
+        self, stream: int, mix: dict[int, float], judged: float = 1.0, *, long: float = 0.0, long_moves: int = 0
+    ) -> None:
         """Use the training seeds and randomness of `stream` (0, 1, ...).
 
         Args:
             stream: Number of this maker; different streams share no level.
             mix: Share of each difficulty among the levels.
             judged: Share of the arrangements of boxes on the way in which every possible push is judged.
+            long: Share of the levels of the hardest difficulty whose solution is long.
+            long_moves: Moves of the shortest solution that counts as long.
 
         Raises:
             ValueError: If the stream has no seeds left in `TRAIN_SEEDS`.
@@ -61,6 +68,7 @@ class LessonMaker:
         self._mix = {d: share / sum(mix.values()) for d, share in mix.items() if share > 0}
         self._teacher = Teacher()
         self._judged = judged
+        self._long, self._long_moves = long, long_moves
         self._lost: dict[int, LevelBatch] = {}
 
     def state(self) -> State:
@@ -84,10 +92,22 @@ class LessonMaker:
         parts = {}
         for difficulty, count in zip(self._mix, counts.tolist(), strict=True):
             if count:
-                seeds = range(self._next, self._next + count)
-                self._next += count
-                parts[difficulty] = generate_batch(difficulty, seeds)
+                long = self._rng.binomial(count, self._long) if difficulty == max(DIFFICULTIES) else 0
+                fresh = self._generate(difficulty, count - long)
+                parts[difficulty] = join_levels([fresh, self._long_levels(difficulty, long)]) if long else fresh
         return parts
+
+    def _generate(self, difficulty: int, n: int) -> LevelBatch:
+        first, self._next = self._next, self._next + n
+        return generate_batch(difficulty, range(first, self._next))
+
+    def _long_levels(self, difficulty: int, n: int) -> LevelBatch:
+        """Return `n` fresh levels whose solutions are long, among many that are not."""
+        found = generate_batch(difficulty, [])
+        while len(found.player) < n:
+            levels = self._generate(difficulty, _CANDIDATES * n)
+            found = join_levels([found, take_levels(levels, self._teacher.moves(levels) >= self._long_moves)])
+        return take_levels(found, np.arange(n))
 
     def demonstrations(self, n: int) -> Samples:
         """Return samples of the solutions of `n` fresh levels, thinned on walks."""
@@ -108,7 +128,7 @@ class LessonMaker:
             levels = join_levels([fresh, self._take_lost(difficulty, int(_REPLAYED * len(fresh.player)))])
             exploration = 0.05 if self._rng.random() < 0.5 else 0.0
             game = play(
-                planner, levels, limit=_PLAY_LIMIT, exploration=exploration, rng=self._rng, reduced_precision=True
+                planner, levels, limit=MOVE_LIMIT, exploration=exploration, rng=self._rng, reduced_precision=True
             )
             first_dead = self._first_dead(levels, game)
             self._keep_lost(difficulty, take_levels(levels, first_dead > 0))
@@ -135,7 +155,7 @@ class LessonMaker:
     ) -> tuple[list[Samples], list[Samples]]:
         """Return samples of where levels were lost, first dead at [B], and of states anywhere on the way of all."""
         batch = np.arange(len(game.moves))
-        length = np.where(game.solved, game.moves, _PLAY_LIMIT)
+        length = np.where(game.solved, game.moves, MOVE_LIMIT)
         lost = first_dead > 0
         parts, on_its_way = [], []
         # Where it went wrong: the state before, what killed it, and a dead state.
@@ -160,7 +180,7 @@ class LessonMaker:
     def _first_dead(self, levels: LevelBatch, game: Game) -> NDArray[np.int64]:
         """Return the first time at which the solver proves each level lost, [B]; -1 where it was never lost."""
         batch = np.arange(len(game.moves))
-        alive, dead = np.zeros(len(batch), np.int64), np.full(len(batch), _PLAY_LIMIT)
+        alive, dead = np.zeros(len(batch), np.int64), np.full(len(batch), MOVE_LIMIT)
         open_ = batch[~game.solved]
         status = self._teacher.judge(_states(levels, game, open_, dead[open_]))
         lost = open_[status == Status.UNSOLVABLE]

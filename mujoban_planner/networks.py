@@ -2,7 +2,8 @@
 
 - `RecurrentPlanner`, the paper's: a repeated ConvLSTM (DRC, Guez et al. 2019), feed-forward in time, with a
   trainable initial hidden state;
-- `ResidualPlanner`, a residual convolutional network with the same heads.
+- `ResidualPlanner`, a residual convolutional network with the same heads;
+- `ThinkingPlanner`, that network with its last blocks repeated as often as time allows.
 
 Shapes: B states, I = 8 rows and columns of the interior, C channels.
 """
@@ -73,6 +74,40 @@ class ResidualPlanner(LearnedPlanner):
             average_pushes(push, symmetries),
             average_pushes(push_alive, symmetries),
         )
+
+
+class ThinkingPlanner(ResidualPlanner):
+    """Residual network whose last blocks are repeated with the same weights, `thinking` times in each decision.
+
+    What was taught with several numbers of repeats can be left to think longer than it was taught (Schwarzschild et
+    al. 2021). With one repeat it is the `ResidualPlanner` of these weights.
+    """
+
+    def __init__(
+        self, channels: int = 64, blocks: int = 12, tied: int = 6, propagation: bool = True, judge: bool = False
+    ) -> None:
+        """Build `blocks` residual blocks of `channels` channels, the last `tied` of which are repeated.
+
+        Raises:
+            ValueError: If there are not so many blocks.
+        """
+        if not 0 < tied <= blocks:
+            raise ValueError(f"tied is {tied}: expected from 1 to all {blocks} blocks")
+        super().__init__(channels, blocks, propagation, judge)
+        self._config["tied"] = tied
+        self._tied = tied
+
+    def features(self, planes: Tensor) -> Tensor:
+        """Return features [B, C, I, I] of planes [B, `inputs`, I, I]."""
+        x = self.blocks[: -self._tied](self.encoder(planes))
+        for _ in range(max(self.thinking, 1)):
+            x = self.blocks[-self._tied :](x)
+        return x
+
+    @property
+    def views(self) -> int:
+        """Symmetric views of the board that go into one decision: it has other ways to think longer."""
+        return 1
 
 
 class ConvLSTMCell(nn.Module):
@@ -156,5 +191,7 @@ def _bias(layer: nn.Conv2d) -> nn.Parameter:
     return layer.bias
 
 
-ARCHITECTURES: dict[str, type[LearnedPlanner]] = {cls.__name__: cls for cls in (ResidualPlanner, RecurrentPlanner)}
+ARCHITECTURES: dict[str, type[LearnedPlanner]] = {
+    cls.__name__: cls for cls in (ResidualPlanner, ThinkingPlanner, RecurrentPlanner)
+}
 """Architecture by the name of its class, as in the records of weights."""

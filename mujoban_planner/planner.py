@@ -68,7 +68,7 @@ class LearnedPlanner(nn.Module, Planner):
         self._config = {**config, "propagation": propagation}
         self.propagation = propagation
         self.thinking = 1
-        """Thinking time: repeats of the recurrent core, or symmetric views, per decision; 1 is as trained."""
+        """Thinking time: repeats of the recurrent core or of the last blocks, or symmetric views, per decision."""
         self.caution = CAUTION
         """Weight of the verdicts on pushes and instructions in a decision; 1 is as trained."""
         self.doubt = DOUBT

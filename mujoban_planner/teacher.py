@@ -47,6 +47,11 @@ class Teacher:
         """Return the solver's status of each state, [B]."""
         return solve_batch(levels, max_nodes=self.max_nodes, weight=_QUICK_WEIGHT).status
 
+    def moves(self, levels: LevelBatch) -> NDArray[np.int64]:
+        """Return how many moves a short, if not the shortest, solution of each state takes, [B]; -1 without one."""
+        solutions = solve_batch(levels, max_nodes=self.max_nodes, weight=_QUICK_WEIGHT)
+        return np.where(solutions.status == Status.SOLVED, solutions.length, -1)
+
     def demonstrate(
         self, levels: LevelBatch, rng: np.random.Generator, *, judged: float = 1.0, keep: int | None = None
     ) -> Samples:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Final, Literal
 
-from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
+from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
 from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_batch
@@ -29,12 +29,14 @@ def difficulty_shares(shares: Shares) -> dict[int, float]:
 class NetworkConfig:
     """What defines a planner network."""
 
-    architecture: Literal["residual", "recurrent"] = "residual"
+    architecture: Literal["residual", "thinking", "recurrent"] = "residual"
     """Network."""
     channels: int = 64
     """Channels of the network."""
     blocks: int = 8
-    """Residual blocks (residual)."""
+    """Residual blocks (residual, thinking)."""
+    tied: int = 6
+    """The last of these blocks, which are repeated (thinking)."""
     depth: int = 3
     """ConvLSTM layers (recurrent)."""
     repeats: int = 3
@@ -54,6 +56,8 @@ class NetworkConfig:
         """Return a new network."""
         if self.architecture == "recurrent":
             return RecurrentPlanner(self.channels, self.depth, self.repeats, self.propagation, self.judge)
+        if self.architecture == "thinking":
+            return ThinkingPlanner(self.channels, self.blocks, self.tied, self.propagation, self.judge)
         return ResidualPlanner(self.channels, self.blocks, self.propagation, self.judge)
 
 

@@ -8,7 +8,7 @@ from mujoban_core.interfaces import take_rows
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.decision import HISTORY, count_visits, initial_means, initial_visits, recall, remember
 from mujoban_planner.heads import Advice, PlannerHeads
-from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
+from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
 from mujoban_planner.planner import LearnedPlanner, input_planes
 from mujoban_planner.play import play
 from mujoban_planner.propagation import legal_pushes
@@ -50,7 +50,10 @@ def _states(n=4, difficulty=5, seed=0):
     return abstract_states(generate_batch(difficulty, range(seed, seed + n)))
 
 
-@pytest.mark.parametrize("planner", [ResidualPlanner(16, 2), RecurrentPlanner(8, 2), RecurrentPlanner(8, 1, 1, True)])
+@pytest.mark.parametrize(
+    "planner",
+    [ResidualPlanner(16, 2), ThinkingPlanner(8, 2, 1), RecurrentPlanner(8, 2), RecurrentPlanner(8, 1, 1, True)],
+)
 def test_decisions_do_not_depend_on_the_batch(planner):
     planner.eval()
     states = _states(6)
@@ -67,6 +70,20 @@ def test_heads_have_the_shapes_of_the_paper_and_gradients_reach_every_weight(pla
     sum(x.square().mean() for x in output if x is not None).backward()
     for name, parameter in planner.named_parameters():
         assert parameter.grad is not None, name
+
+
+def test_a_thinking_planner_repeats_its_last_blocks():
+    planner, plain = ThinkingPlanner(8, 3, tied=2).eval(), ResidualPlanner(8, 3).eval()
+    for parameter in planner.parameters():
+        torch.nn.init.normal_(parameter, 0.0, 0.1)
+    plain.load_state_dict(planner.state_dict())
+    states = torch.from_numpy(_states(2))
+    assert torch.equal(planner(states).policy, plain(states).policy)
+    planner.thinking = 3
+    plain.blocks.extend([plain.blocks[1], plain.blocks[2]] * 2)
+    assert torch.equal(planner(states).policy, plain(states).policy)
+    with pytest.raises(ValueError, match="tied is 4: expected from 1 to all 3"):
+        ThinkingPlanner(8, 3, tied=4)
 
 
 def test_recurrent_core_starts_from_a_trainable_state_and_thinks_longer_on_demand():

@@ -143,6 +143,15 @@ def test_lessons_are_deterministic_and_streams_differ():
         LessonMaker(-1, mix)
 
 
+def test_lessons_can_be_of_long_levels():
+    maker = LessonMaker(6, {4: 0.5, 5: 0.5}, long=1.0, long_moves=40)
+    levels = maker.levels(12)
+    assert (Teacher().moves(levels[5]) >= 40).all()
+    assert (Teacher().moves(levels[4]) < 40).any()
+    usual = LessonMaker(6, {5: 1.0}, long=0.5, long_moves=40).levels(40)[5]
+    assert len(usual.player) == 40 and 10 < (Teacher().moves(usual) >= 40).sum() < 36
+
+
 def test_corrections_show_the_way_from_where_an_untrained_planner_went_wrong():
     samples = LessonMaker(3, {5: 1.0}).corrections(ResidualPlanner(8, 1).eval(), n=6)
     deadly = (samples.dead != 0) & (samples.dead != 31)

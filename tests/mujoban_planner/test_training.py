@@ -23,7 +23,7 @@ from mujoban_planner.growth import start_from
 from mujoban_planner.imitation import ImitationConfig, imitation, imitation_loss
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.moves import LevelStream
-from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
+from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
 from mujoban_planner.reinforcement import MPOConfig, MPOLearner, reinforcement, reset_stay_logit
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
@@ -243,6 +243,10 @@ def test_a_larger_network_begins_with_what_a_smaller_one_says(tmp_path):
     large = ResidualPlanner(24, 3, judge=True)
     start_from(large, path)
     for expected, given in zip(small(states), large(states), strict=True):
+        assert torch.allclose(expected, given, atol=1e-4)
+    repeating = ThinkingPlanner(16, 2, tied=1, judge=True)
+    start_from(repeating, path)
+    for expected, given in zip(small(states), repeating(states), strict=True):
         assert torch.allclose(expected, given, atol=1e-4)
     for other in (ResidualPlanner(8, 1, judge=True), RecurrentPlanner(16, propagation=True, judge=True)):
         with pytest.raises(WeightsError, match="at most the channels"):
