@@ -6,6 +6,11 @@ over the machines of a Ray cluster.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn

@@ -7,6 +7,11 @@ the graph either: it runs at low priority, drops what it has no time for, and dr
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 import os
 import time
 from collections import Counter

@@ -5,6 +5,11 @@ Run as ``python -m bringup.picture docs/images/world.png --seed 5``; the episode
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

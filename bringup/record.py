@@ -7,6 +7,11 @@ more than the states that it would visit; `--undisturbed` leaves it alone. Sever
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 import multiprocessing
 import shutil
 from collections.abc import Callable, Iterator, Sequence

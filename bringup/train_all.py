@@ -9,6 +9,11 @@ up all modules where a finished one has left them.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,6 +5,11 @@ It only subscribes to the graph, so it works beside a running stack and on a bag
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 from array import array
 from collections import Counter
 from collections.abc import Sequence

@@ -9,6 +9,11 @@ Give the directory again to resume a run; it leaves `agent.safetensors`, for `br
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field

@@ -7,6 +7,11 @@ with the scripted driver or a privileged teacher under the same judgement, which
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

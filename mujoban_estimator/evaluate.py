@@ -5,6 +5,11 @@ Both see what was recorded, the instructions and terminations included, whatever
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

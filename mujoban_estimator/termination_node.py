@@ -5,6 +5,11 @@ Run it with `python -m mujoban_estimator.termination_node`.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 from collections.abc import Sequence
 from typing import Any, Unpack
 

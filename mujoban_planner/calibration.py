@@ -9,6 +9,11 @@ Shapes: S samples, D = 4 directions, I = 8 rows and columns of the interior, X p
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

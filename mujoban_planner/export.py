@@ -6,6 +6,11 @@ run it too: it holds the weights, takes `compiled.INPUTS` and returns `compiled.
 
 from __future__ import annotations
 
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
 import json
 import logging
 from collections.abc import Iterable, Sequence

@@ -166,11 +166,32 @@ def test_what_cannot_be_trained_is_one_line(capfd):
     assert capfd.readouterr().err == "command: error: module oracle, expected controller|planner|estimator|baselines\n"
 
 
-def test_the_installed_commands_are_the_programs():
-    scripts = tomllib.loads((Path(run_stack.__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
-    for name in ("mujoban-run", "mujoban-evaluate", "mujoban-record", "mujoban-train"):
-        module, function = scripts[name].split(":")
-        assert callable(getattr(import_module(module), function))
+def _installed() -> dict[str, str]:
+    return tomllib.loads((Path(run_stack.__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
+
+
+@pytest.mark.parametrize("name", ["run", "evaluate", "record", "train"])
+def test_the_installed_commands_are_the_programs(name, monkeypatch, capfd):
+    module, function = _installed()[f"mujoban-{name}"].split(":")
+    monkeypatch.setattr(sys, "argv", [f"mujoban-{name}", "--help"])
+    monkeypatch.setattr("mujoban_core.program.leave", sys.exit)
+    monkeypatch.setattr("bringup.commands.end_at_once", lambda: None)
+    with pytest.raises(SystemExit) as left:
+        getattr(import_module(module), function)()
+    assert left.value.code == 0 and f"mujoban-{name}" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("program", ["bringup.run_stack", "bringup.record", "mujoban_planner.train"])
+def test_a_ctrl_c_while_a_program_is_still_being_imported_leaves_no_traceback(program, tmp_path):
+    (tmp_path / "tyro.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(9)\n")
+    done = subprocess.run(
+        [sys.executable, "-m", program],
+        cwd=Path(run_stack.__file__).parents[1],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, b"", b"")
 
 
 def test_an_option_that_must_be_given_is_named(capfd):
