@@ -8,6 +8,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
@@ -87,8 +88,11 @@ class InProcess:
         self._parameters = parameters
         self._context = context
         self._others: list[Node] = []
-        for name in names:
-            self.start(name)
+        with ExitStack() as undo:
+            undo.push(self)
+            for name in names:
+                self.start(name)
+            undo.pop_all()
 
     def __enter__(self) -> InProcess:
         """Return this graph."""

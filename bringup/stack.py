@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-import rclpy
 from rclpy.executors import Executor
 from rclpy.parameter import Parameter
 
@@ -30,7 +29,7 @@ from mujoban_core.plugins import AGENT, ROLES
 from mujoban_core.signals import StopSignal
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
-from mujoban_msgs_py.runtime.tick_node import init_ros, spin
+from mujoban_msgs_py.runtime.tick_node import ros_context, spin
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.episodes import Episodes
 
@@ -108,8 +107,7 @@ def play(
         set_threads(stack.threads)
         clear_shared_memory()
         exits.enter_context(claim_domain())
-        init_ros()
-        exits.callback(rclpy.try_shutdown)
+        exits.enter_context(ros_context())
         graph = exits.enter_context(InProcess(parameters, () if options.processes else parameters))
         alone = isinstance(stack, Solo)
         for role in () if options.processes else (AGENT,) if alone else ROLES:

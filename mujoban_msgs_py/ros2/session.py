@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
@@ -17,7 +18,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from mujoban_msgs_py.runtime.tick_node import init_ros
+from mujoban_msgs_py.runtime.tick_node import ros_context
 
 DISCOVERY_LIMIT: Final = 5.0
 """Seconds within which what exists has been discovered."""
@@ -48,26 +49,31 @@ class Session:
         self._sim_time = sim_time
 
     def __enter__(self) -> Self:
-        self._context = rclpy.Context()
-        init_ros([], self._context)
+        with ExitStack() as exits:
+            self._enter(exits)
+            self._exits = exits.pop_all()
+        return self
+
+    def _enter(self, exits: ExitStack) -> None:
+        context = rclpy.Context()
+        exits.enter_context(ros_context([], context))
         overrides = [Parameter("use_sim_time", value=True)] if self._sim_time else []
         name = f"_ros2cli_{os.getpid()}"
         self.node = rclpy.create_node(
             name,
-            context=self._context,
+            context=context,
             enable_rosout=False,
             start_parameter_services=False,
             parameter_overrides=overrides,
         )
-        self.executor: Executor = EventsExecutor(context=self._context)
+        self.executor: Executor = EventsExecutor(context=context)
         self.executor.add_node(self.node)
-        return self
+        exits.callback(self.node.destroy_node)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.node.destroy_node()
-        self._context.try_shutdown()
+        self._exits.__exit__(kind, error, trace)
 
     def until(self, done: Callable[[], bool], timeout: float | None = DISCOVERY_LIMIT) -> bool:
         """Spin until `done` or for `timeout` seconds (None: for ever); returns whether it is done."""

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Iterable, Set
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -63,24 +64,53 @@ def clear_shared_memory(folder: Path = FOLDER) -> list[str]:
     A segment in use is held by a lock on the file beside it, which Fast DDS itself goes by (`fastdds shm clean`). It
     may be without that file for a moment; so what any process has open or has mapped is left alone as well.
     """
-    groups: dict[str, list[Path]] = {}
-    for file in sorted(folder.glob("*fastrtps_*")):
-        match = _SEGMENT.fullmatch(file.name)
-        if match is not None and _is_own(file):
-            groups.setdefault(match[1], []).append(file)
+    groups = _segments(folder)
     # The look at the processes comes after that at the files: whoever has just made one has it open or mapped by now.
     used = _used_names() if groups else set()
     removed = []
     for files in groups.values():
         if used.isdisjoint(file.name for file in files) and not any(map(_is_locked, files)):
-            for file in files:
-                file.unlink(missing_ok=True)
-                removed.append(file.name)
+            removed += _remove(files)
     for run in filter(_is_own, sorted(folder.glob(f"{_RUN}*"))):
         if (lock := _lock(run)) >= 0:
             shutil.rmtree(run, ignore_errors=True)
             os.close(lock)
             removed.append(run.name)
+    return removed
+
+
+def mapped_segments() -> set[str]:
+    """Return the names of the segments and ports of Fast DDS that this process has mapped."""
+    names = _SEGMENT.findall(Path("/proc/self/maps").read_text(errors="replace"))
+    return set(names)
+
+
+def release_segments(names: Set[str], folder: Path = FOLDER) -> list[str]:
+    """Remove segments and ports that this process holds and no other; return the names of the files.
+
+    For a program that ends with participants which it cannot put away in order, as it was interrupted while it made
+    them.
+    """
+    groups = [files for name, files in _segments(folder).items() if name in names]
+    used = _used_names(but=os.getpid()) if groups else set()
+    return [name for files in groups if used.isdisjoint(file.name for file in files) for name in _remove(files)]
+
+
+def _segments(folder: Path) -> dict[str, list[Path]]:
+    """Return this user's segments and ports: name -> files."""
+    groups: dict[str, list[Path]] = {}
+    for file in sorted(folder.glob("*fastrtps_*")):
+        match = _SEGMENT.fullmatch(file.name)
+        if match is not None and _is_own(file):
+            groups.setdefault(match[1], []).append(file)
+    return groups
+
+
+def _remove(files: Iterable[Path]) -> list[str]:
+    removed = []
+    for file in files:
+        file.unlink(missing_ok=True)
+        removed.append(file.name)
     return removed
 
 
@@ -104,10 +134,10 @@ def _is_locked(file: Path) -> bool:
     return False
 
 
-def _used_names() -> set[str]:
-    """Return the names of the files in shared memory that any process of this user has open, then those mapped."""
+def _used_names(but: int = 0) -> set[str]:
+    """Return the names of the files in shared memory that any process of this user but one has open, and mapped."""
     names: set[str] = set()
-    processes = [entry for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
+    processes = [entry for entry in Path("/proc").iterdir() if entry.name.isdecimal() and entry.name != str(but)]
     for process in processes:
         try:
             links = list((process / "fd").iterdir())

@@ -13,7 +13,8 @@ import sys
 import time
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple, Unpack
 
@@ -37,6 +38,7 @@ from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.ending_node import EndingNode
+from mujoban_msgs_py.runtime.shared_memory import mapped_segments, release_segments
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import EPISODE, QUEUE_DEPTH, Message, Topic
@@ -255,6 +257,24 @@ def init_ros(args: Sequence[str] | None = None, context: Context | None = None) 
         ) from error
 
 
+@contextmanager
+def ros_context(args: Sequence[str] | None = None, context: Context | None = None) -> Iterator[None]:
+    """Initialise rclpy as `init_ros` does, and shut it down.
+
+    An error, or an interruption, may come while a node is being made, which nobody then can destroy: what it has in
+    shared memory is removed.
+    """
+    before = mapped_segments()
+    try:
+        init_ros(args, context)
+        yield
+    except BaseException:
+        rclpy.try_shutdown(context=context)
+        release_segments(mapped_segments() - before)
+        raise
+    rclpy.try_shutdown(context=context)
+
+
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     """Run one node in a process of its own until it is interrupted or the process that started it ends.
 
@@ -267,22 +287,23 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
         about bad input.
     """
     end_with_parent()
-    node = None
     try:
-        with interruptible(), StopSignal(deferred=False) as stop:
-            init_ros(args)
-            node = make()
-            stop.deferred = True
-            executor = EventsExecutor()
-            executor.add_node(node)
-            spin(executor, Future(), stop)
+        with interruptible(), StopSignal(deferred=False) as stop, ros_context(args):
+            _run(make, stop)
     except KeyboardInterrupt:
         pass
     except (ValueError, OSError, ParameterException) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    finally:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
     return 0
+
+
+def _run(make: Callable[[], Node], stop: StopSignal) -> None:
+    node = make()
+    stop.deferred = True
+    try:
+        executor = EventsExecutor()
+        executor.add_node(node)
+        spin(executor, Future(), stop)
+    finally:
+        node.destroy_node()

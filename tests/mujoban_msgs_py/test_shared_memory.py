@@ -5,7 +5,11 @@ import os
 import subprocess
 import sys
 
-from mujoban_msgs_py.runtime.shared_memory import RunFolder, clear_shared_memory
+import pytest
+import rclpy
+
+from mujoban_msgs_py.runtime.shared_memory import FOLDER, RunFolder, clear_shared_memory, mapped_segments
+from mujoban_msgs_py.runtime.tick_node import ros_context
 
 SEGMENT = "fastrtps_0123456789abcdef"
 
@@ -36,3 +40,17 @@ def test_the_folder_of_a_run_that_was_killed_is_removed_and_that_of_one_that_liv
     assert (lives.path / "kept").exists()
     lives.remove()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_node_that_nobody_can_destroy_any_more_leaves_nothing(ros):
+    others = ros.create_node("other")
+    before, context = mapped_segments(), rclpy.Context()
+    with pytest.raises(KeyboardInterrupt), ros_context(context=context):
+        half_made = ros.create_node("half_made", context=context)
+        held = mapped_segments()
+        raise KeyboardInterrupt
+    ours = {name for name in held - before if "port" not in name}  # another program's test may use the same port
+    assert ours and before and all((FOLDER / name).exists() for name in before)
+    assert not [name for name in ours if (FOLDER / name).exists()]
+    half_made.destroy_node()
+    others.destroy_node()
