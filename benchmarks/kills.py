@@ -137,7 +137,13 @@ def compare(results: list[EpisodeResult], expected: list[EpisodeResult]) -> dict
         "solved_undisturbed": sum(e.solved for e in expected),
         "lost_by_kills": {seed: str(failure) for seed, failure in lost.items() if failure is not None},
         "equal": sum(by_seed.get(e.seed) == e for e in expected),
+        "different": {e.seed: _differences(by_seed[e.seed], e) for e in expected if by_seed.get(e.seed, e) != e},
     }
+
+
+def _differences(result: EpisodeResult, expected: EpisodeResult) -> str:
+    one, other = result.to_json(), expected.to_json()
+    return ", ".join(f"{name} {one[name]}, not {other[name]}" for name in one if one[name] != other[name])
 
 
 def run(options: Options | None = None) -> dict[str, Any]:

@@ -60,6 +60,7 @@ PARAMETERS: Final[dict[str, tuple[Any, ParameterDescriptor]]] = {
     "world": (DEFAULT_WORLD, _setting(f"the physical world: {_WORLDS}")),
     "realtime": (0.0, _setting("simulated seconds per second; 0: lockstep", 0.0, FASTEST)),
     "resend_after": (0.2, _setting("seconds without an answer until a tick is offered again", 0.01, 3600.0)),
+    "hold_limit": (1, _setting("ticks for which a torque is held in real time until the clock waits", 1, 1000)),
     "await_recorder": (False, _setting("whether in lockstep a recorder must have written a tick before the next")),
     "await_monitor": (False, _setting("whether in lockstep a monitor must have heard a tick before the next")),
     "instructed": (True, _setting("whether torques follow instructions, which a tick then awaits as well")),
@@ -73,21 +74,20 @@ class SimulatorNode(EndingNode):
     """Plays episodes, in lockstep with the graph or in real time.
 
     In lockstep the world steps when the torque and the instruction of the current stamp have arrived, so a run
-    is deterministic. In real time it steps when the clock says so, and holds the latest torque for a while.
+    is deterministic. In real time it steps when the clock says so, and holds the latest torque for `hold_limit` ticks.
 
     Parameters:
         seed, episodes, difficulty, level_file: Which episodes are played, see `mujoban_sokoban.episodes.Episodes`;
             `episodes` 0 means as many as a level file has, else one.
         time_limit: Steps of an episode; 0 means that of the body.
-        body: The robot's body.
-        world: The physical world, see `mujoban_sim.presets`.
+        body, world: The robot's body, and the physical world, see `mujoban_sim.presets`.
         realtime: Simulated seconds per second; 0 is lockstep.
-        resend_after: Seconds without an answer after which a tick is offered again; in real time the clock then waits.
+        resend_after: Seconds without an answer after which a tick is offered again.
+        hold_limit: Ticks for which the latest torque is held in real time, after which the clock waits for another.
         await_recorder, await_monitor: Whether a tick, in real time the first, waits until that one has acknowledged it.
         instructed: Whether instructions come with the torques; those who play without modules send torques alone.
         top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
-        resume_file: Where the node keeps every tick that it offers, so that it goes on from there after it was killed;
-            empty means nowhere.
+        resume_file: Where the node keeps every tick that it offers, to go on from after a crash; empty means nowhere.
 
     Services: `/reset` starts the episode again, `/pause` (true or false) holds the world, `/step` advances a held
     world by one tick.
@@ -139,7 +139,7 @@ class SimulatorNode(EndingNode):
         self._resumed = self._restore()
         # What is missing to draw with shows now, and the first tick is as quick as the others.
         self.world.render()
-        self._pace = Pace(self._speed, patience=self._settings["resend_after"])
+        self._pace = Pace(self._speed, self._settings["resend_after"], self._settings["hold_limit"])
         self._listen()
         report_on(self, self._condition)
         self._start_timer = self.create_timer(MATCH_PERIOD, self._start_when_complete)
@@ -279,16 +279,17 @@ class SimulatorNode(EndingNode):
             return
         if (complaint := self._pace.complaint(now)) is not None:
             self.get_logger().warning(complaint)
-        if not self._ended and self._torque is None:
-            self.counts["late answers"] += 1
-        self._advance()
+        if self._ended or not self._pace.outruns(self._stamp):
+            self._advance()
 
     def _advance(self) -> None:
         """Apply the tick's answers and offer the next tick, of this episode or of the next."""
         if self._ended:
             self._end()
             return
-        if self._torque is not None:
+        if self._torque is None:
+            self.counts["late answers"] += 1
+        else:
             self._held_torque = self._torque
         if self._instruction is not None:
             issued = self._instruction != self._in_force
@@ -319,7 +320,7 @@ class SimulatorNode(EndingNode):
     def _on_torque(self, message: Received) -> None:
         if not self._is_known(message.stamp, topics.TORQUE.name):
             return
-        self._pace.heard = time.perf_counter()
+        self._pace.hear(message.stamp, time.perf_counter())
         if message.stamp == self._stamp:
             self._torque = message.content
             self._proceed()
@@ -381,9 +382,8 @@ class SimulatorNode(EndingNode):
     def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._paused
         response.message = "one tick" if self._paused else "not paused: call /pause first"
-        if self._paused:
-            self._steps_due += 1
-            self._proceed()
+        self._steps_due += self._paused
+        self._proceed()
         return response
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from mujoban_core.grid import CONTROL_PERIOD
+from mujoban_msgs_py.topics import TICK
 
 WINDOW: Final = 10.0
 """Seconds that are looked at together; at most one warning comes of each."""
@@ -22,11 +23,15 @@ class Pace:
     speed: float
     """Simulated seconds per second that are wanted; 0 is lockstep, which keeps to no clock."""
     patience: float
-    """Seconds without an answer after which the clock waits: a robot must not drive on without a driver."""
+    """Seconds without an answer after which the clock is stopped."""
+    hold: int
+    """Ticks for which a torque is held until the clock waits: a robot must not drive on without a driver."""
     running: bool = False
     """Whether the clock runs; it starts with the first tick that was answered."""
     heard: float = 0.0
     """When the last answer came, to this tick or to one before."""
+    newest: int = 0
+    """Stamp of the newest tick that was answered [ns]."""
     ticks: int = 0
     """In the window so far."""
     late: int = 0
@@ -49,6 +54,14 @@ class Pace:
             self.running = self._kept = False
             return True
         return False
+
+    def hear(self, stamp: int, now: float) -> None:
+        """Note an answer to the tick of a stamp."""
+        self.newest, self.heard = max(self.newest, stamp), now
+
+    def outruns(self, stamp: int) -> bool:
+        """Tell whether the clock is too far ahead of the answers to go on from the tick of a stamp."""
+        return stamp - self.newest > self.hold * TICK
 
     def start(self, now: float) -> None:
         """Begin a window, as after a pause; `now` in seconds of a clock that never jumps."""

@@ -168,8 +168,11 @@ class TickNode(EndingNode):
         assert self._join is not None
         complete = self._join.add(topic.name, stamp, item)
         if complete is not None:
-            # Where time does not wait, a tick that is still open has lost its chance, and so has what it waits for.
-            self._offers = 0 if self._open is None else PATIENCE + 1
+            if self._open is None:
+                self._offers = 0
+            elif self._open[0] != stamp:
+                # Where time does not wait, a tick that is still open has lost its chance, and so has what it waits for.
+                self._offers = PATIENCE + 1
             self._open = (stamp, complete)
             self.retry()
 

@@ -1,0 +1,51 @@
+"""How long a node waits for what belongs to a tick besides its inputs."""
+
+import pytest
+from geometry_msgs.msg import PoseStamped
+from mujoban_msgs.msg import Episode
+from rclpy.serialization import serialize_message
+
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.runtime.tick_node import PATIENCE, Input, TickNode
+
+
+class Waiting(TickNode):
+    """Answers a tick only where it is told that waiting will not help."""
+
+    def __init__(self):
+        super().__init__("waiting")
+        self.answered = []
+        self.open_inputs([Input(topics.POSE, None)])
+
+    def answer(self, stamp, episode, inputs, *, insist):
+        if not insist:
+            return None
+        self.answered.append(stamp // topics.TICK)
+        return ()
+
+    def offer(self, tick):
+        header = conversions.header(tick * topics.TICK)
+        pose = PoseStamped(header=header)
+        for topic, message in ((topics.EPISODE, Episode(header=header, episode=1, step=tick)), (topics.POSE, pose)):
+            self._receive(topic, None, serialize_message(message))
+
+
+@pytest.fixture
+def waiting(ros):
+    node = Waiting()
+    yield node
+    node.destroy_node()
+
+
+def test_a_tick_that_is_offered_again_is_waited_for_as_long_as_before(waiting):
+    for _ in range(1 + PATIENCE):
+        waiting.offer(5)
+    assert waiting.answered == []
+    waiting.offer(5)
+    assert waiting.answered == [5]
+
+
+def test_where_time_goes_on_the_next_tick_does_not_wait_as_well(waiting):
+    waiting.offer(5)
+    waiting.offer(6)
+    assert waiting.answered == [6]
