@@ -60,6 +60,8 @@ def graph_parameters(stack: Player, episodes: Episodes, **simulator: Any) -> Par
         return {"simulator": parameters["simulator"], AGENT: _loaded(stack.choice, stack)}
     for role in ROLES:
         parameters[role] |= _loaded(stack.choices[role], stack)
+    if simulator.get("realtime"):
+        parameters["termination"]["patience"] = 1
     for role in LOOKING_ROLES:
         parameters[role]["look_around"] = stack.look_around_ticks
     parameters["planner"] |= {

@@ -22,9 +22,9 @@ from mujoban_core.interfaces import NO_INSTRUCTION, GroundTruth, Termination, Te
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
-from mujoban_msgs_py.runtime.descriptors import NodeOptions, described
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.module_node import MOST_TICKS, ModuleNode
-from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
+from mujoban_msgs_py.runtime.tick_node import PATIENCE, Input, Output, run_node
 
 REMEMBERED = 64
 """Instructions kept while it is not known which tick they precede: those of other ticks may come in between."""
@@ -42,6 +42,8 @@ class TerminationNode(ModuleNode[Termination]):
         sample: Whether beta is sampled from its probability, as in the paper.
         threshold: Probability above which beta is true where it is not sampled.
         limit: Ticks after which beta is forced.
+        patience: Offers of a tick until it is classified without the instruction of the tick before. In lockstep that
+            instruction exists, and comes; in real time none may have been given. Fixed when the node starts.
     """
 
     role = "termination"
@@ -58,6 +60,8 @@ class TerminationNode(ModuleNode[Termination]):
         for name, descriptor in _SETTINGS.items():
             setattr(self.module, name, self.declare_parameter(name, getattr(self.module, name), descriptor).value)
         check_termination(limit=self.module.limit, threshold=self.module.threshold)
+        about = "offers of a tick until it is classified without the instruction before it; few in real time"
+        self.patience: int = declare(self, "patience", PATIENCE, described(about, fixed=True, low=0, high=MOST_TICKS))
         listen(self, topics.INSTRUCTION, self._on_instruction)
 
     def initial_state(self, number: int) -> Any:

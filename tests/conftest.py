@@ -1,4 +1,4 @@
-"""What all tests share: a private ROS domain on this host, checked message fields, one software-rendering thread."""
+"""What all tests share: a private ROS domain on loopback, checked message fields, one software-rendering thread."""
 
 import os
 import sys
@@ -6,12 +6,18 @@ from pathlib import Path
 
 # Before anything imports ROS or MuJoCo.
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("LP_NUM_THREADS", "0")
 
 import pytest
+
+from mujoban_msgs_py.runtime.discovery import PROFILES, RANGE, confine_discovery
+
+# Before ROS is initialised, here or in a child process.
+for name in (RANGE, PROFILES):
+    os.environ.pop(name, None)
+confine_discovery()
 
 IMPORTABLE = str(Path(__file__).parent / "importable")
 """Where worker processes import from what tests let them do."""

@@ -72,7 +72,7 @@ def run(arguments: Sequence[str]) -> int:
     """Parse the arguments and run the verb; returns the exit status."""
     # Message fields are typed in by hand here, and unchecked ones of the wrong type would be corrupted silently.
     os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
-    from mujoban_msgs_py.runtime.tick_node import confine_discovery
+    from mujoban_msgs_py.runtime.discovery import confine_discovery
 
     confine_discovery()
     options = make_parser(next(iter(arguments), None)).parse_args(arguments)

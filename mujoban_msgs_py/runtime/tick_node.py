@@ -7,7 +7,6 @@ neighbour which was restarted in between receives what it has missed.
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 import time
@@ -37,6 +36,7 @@ from mujoban_msgs_py.listening import reject
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
+from mujoban_msgs_py.runtime.discovery import confine_discovery
 from mujoban_msgs_py.runtime.ending_node import EndingNode
 from mujoban_msgs_py.runtime.shared_memory import mapped_segments, release_segments
 from mujoban_msgs_py.seldom import is_due
@@ -67,13 +67,19 @@ class Output(NamedTuple):
 
 
 class TickNode(EndingNode):
-    """A node that answers each tick of the simulator."""
+    """A node that answers each tick of the simulator.
+
+    Attributes:
+        counts: Events that a user should know of, such as rejected messages.
+        patience: Offers of the same tick until `answer` is told that waiting will not help.
+    """
+
+    patience = PATIENCE
 
     def __init__(self, name: str, **options: Unpack[NodeOptions]) -> None:
         """Make the node; `open_inputs` starts it."""
         super().__init__(name, **options)
         self.counts: Counter[str] = Counter()
-        """Events that a user should know of, such as rejected messages."""
         self._join: Synchroniser | None = None
         self._handled = -1
         self._outputs: Sequence[Output] = ()
@@ -142,7 +148,7 @@ class TickNode(EndingNode):
             return
         stamp, inputs = self._open
         episode = inputs[EPISODE.name]
-        outputs = self.answer(stamp, episode, inputs, insist=self._offers > PATIENCE)
+        outputs = self.answer(stamp, episode, inputs, insist=self._offers > self.patience)
         if outputs is None:
             return
         self._open, self._handled, self._outputs = None, stamp, outputs
@@ -172,7 +178,7 @@ class TickNode(EndingNode):
                 self._offers = 0
             elif self._open[0] != stamp:
                 # Where time does not wait, a tick that is still open has lost its chance, and so has what it waits for.
-                self._offers = PATIENCE + 1
+                self._offers = self.patience + 1
             self._open = (stamp, complete)
             self.retry()
 
@@ -230,11 +236,6 @@ def spin(executor: Executor, until: Future, stop: StopSignal) -> None:
         while not (until.done() or stop.requested):
             executor.spin_until_future_complete(ended, timeout_sec=_DEADLINE)
     stop.check()
-
-
-def confine_discovery() -> None:
-    """Keep discovery on this host unless the environment says otherwise; call before rclpy is initialised."""
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
 def init_ros(args: Sequence[str] | None = None, context: Context | None = None) -> None:

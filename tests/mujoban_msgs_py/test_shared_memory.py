@@ -8,8 +8,9 @@ import sys
 import pytest
 import rclpy
 
+from mujoban_msgs_py.runtime.discovery import RANGE
 from mujoban_msgs_py.runtime.shared_memory import FOLDER, RunFolder, clear_shared_memory, mapped_segments
-from mujoban_msgs_py.runtime.tick_node import ros_context
+from mujoban_msgs_py.runtime.tick_node import init_ros, ros_context
 
 SEGMENT = "fastrtps_0123456789abcdef"
 
@@ -42,9 +43,12 @@ def test_the_folder_of_a_run_that_was_killed_is_removed_and_that_of_one_that_liv
     assert not list(tmp_path.iterdir())
 
 
-def test_a_node_that_nobody_can_destroy_any_more_leaves_nothing(ros):
-    others = ros.create_node("other")
-    before, context = mapped_segments(), rclpy.Context()
+def test_a_node_that_nobody_can_destroy_any_more_leaves_nothing(ros, monkeypatch):
+    monkeypatch.setenv(RANGE, "LOCALHOST")  # as Fast DDS understands it, with shared memory
+    alive, context = rclpy.Context(), rclpy.Context()
+    init_ros([], alive)
+    others = rclpy.create_node("other", context=alive)
+    before = mapped_segments()
     with pytest.raises(KeyboardInterrupt), ros_context(context=context):
         half_made = ros.create_node("half_made", context=context)
         held = mapped_segments()
@@ -54,3 +58,4 @@ def test_a_node_that_nobody_can_destroy_any_more_leaves_nothing(ros):
     assert not [name for name in ours if (FOLDER / name).exists()]
     half_made.destroy_node()
     others.destroy_node()
+    alive.try_shutdown()

@@ -1,0 +1,27 @@
+"""How far nodes reach: this host alone, unless the environment says otherwise."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+RANGE: Final = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+PROFILES: Final = "FASTRTPS_DEFAULT_PROFILES_FILE"
+LOOPBACK: Final = Path(__file__).with_name("loopback.xml")
+_FAST_DDS: Final = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
+
+
+def confine_discovery() -> None:
+    """Keep ROS on this host's loopback interface, for child processes as well; call before rclpy is initialised.
+
+    A range, or a profile of Fast DDS, that the environment names is left as it is. Without Fast DDS the range is
+    `LOCALHOST`, as each middleware understands it.
+    """
+    if RANGE in os.environ:
+        return
+    ours = os.environ.get("RMW_IMPLEMENTATION", _FAST_DDS[0]) in _FAST_DDS and PROFILES not in os.environ
+    if ours:
+        os.environ[PROFILES] = str(LOOPBACK)
+    # To Fast DDS, the system's default is what the profile says; `LOCALHOST` would add transports of its own to it.
+    os.environ[RANGE] = "SYSTEM_DEFAULT" if ours else "LOCALHOST"
