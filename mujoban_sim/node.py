@@ -382,8 +382,9 @@ class SimulatorNode(EndingNode):
     def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._paused
         response.message = "one tick" if self._paused else "not paused: call /pause first"
-        self._steps_due += self._paused
-        self._proceed()
+        if self._paused:
+            self._steps_due += 1
+            self._proceed()
         return response
 
 

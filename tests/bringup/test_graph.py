@@ -272,6 +272,9 @@ def test_in_real_time_the_latest_torque_is_held_for_a_few_ticks_until_the_clock_
     graph.spin_until(lambda: simulator.counts["repeated ticks"] >= 2 and simulator.counts["waits of the clock"])
     assert simulator.ticks == 11 and simulator.counts["late answers"] == 10, "the robot drives on without a driver"
     assert abs(simulator.world.velocity[0, 2]) > 0.5
+    assert simulator.counts["waits of the clock"] == 1
+    graph.spin_until(lambda: simulator.counts["repeated ticks"] >= 4)
+    assert simulator.ticks == 11
     answer()
     graph.spin_until(lambda: simulator.ticks > 11)
 

@@ -11,7 +11,7 @@ from mujoban_msgs_py.runtime import discovery
 from mujoban_msgs_py.runtime.discovery import LOOPBACK, PROFILES, RANGE
 
 NODE = """
-import sys, time, rclpy
+import time, rclpy
 from mujoban_msgs_py.runtime.tick_node import init_ros
 init_ros([])
 node = rclpy.create_node("lonely")
