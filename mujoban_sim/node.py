@@ -89,8 +89,7 @@ class SimulatorNode(EndingNode):
         top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
         resume_file: Where the node keeps every tick that it offers, to go on from after a crash; empty means nowhere.
 
-    Services: `/reset` starts the episode again, `/pause` (true or false) holds the world, `/step` advances a held
-    world by one tick.
+    Services: `/reset` starts the episode again, `/pause` (true or false) holds the world, `/step` advances it a tick.
 
     Attributes:
         counts: Events that a user should know of: late answers, rejected torques and so on.
@@ -274,12 +273,13 @@ class SimulatorNode(EndingNode):
             return
         if self._pace.falls_silent(now, answered=self._answered):
             self._reject("waits of the clock", f"no torque for {self._pace.patience} s: the clock waits for one")
-        if not (self._pace.running and self._may_step()):
+        waits = self._pace.outruns(self._stamp) and not self._ended
+        if not (self._pace.running and (waits or self._may_step())):
             self._pace.start(now)
             return
         if (complaint := self._pace.complaint(now)) is not None:
             self.get_logger().warning(complaint)
-        if self._ended or not self._pace.outruns(self._stamp):
+        if not waits:
             self._advance()
 
     def _advance(self) -> None:
