@@ -13,7 +13,7 @@ from pathlib import Path
 from launch import LaunchDescription  # pyright: ignore
 from launch.actions import DeclareLaunchArgument, ExecuteProcess  # pyright: ignore
 from launch.conditions import IfCondition  # pyright: ignore
-from launch.substitutions import LaunchConfiguration  # pyright: ignore
+from launch.substitutions import LaunchConfiguration, PythonExpression  # pyright: ignore
 
 ROOT = Path(__file__).resolve().parents[2]
 OWN = ROOT / ".venv" / "bin" / "python"
@@ -49,6 +49,9 @@ def generate_launch_description() -> LaunchDescription:
         kept = {name: text for name, text in os.environ.items() if name not in MIXING}
         return ExecuteProcess(cmd=command, cwd=str(ROOT), env=kept, output="screen", **options)
 
+    # As in run_stack.py: in real time the clock would wait for what a restarted planner can no longer say.
+    timely = ("-p", ["patience:=", PythonExpression(["1 if float('", value["realtime"], "') else 60"])])
+
     return LaunchDescription(
         [
             *declared,
@@ -57,7 +60,10 @@ def generate_launch_description() -> LaunchDescription:
                 "-p", ["difficulty:=", value["difficulty"]],
                 "-p", ["realtime:=", value["realtime"]],
             ),
-            *(node(module, "-p", ["module:=", value["module"]]) for module in MODULES.values()),
+            *(
+                node(module, "-p", ["module:=", value["module"]], *(timely if name == "termination" else ()))
+                for name, module in MODULES.items()
+            ),
             node("bringup.viz", condition=IfCondition(value["viz"])),
         ]
     )  # fmt: skip
