@@ -179,18 +179,21 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
     )
     difficulties = [job.episodes.difficulty(i) for i in range(len(job.episodes))]
     recorder = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix, world=job.world)
-    try:
-        # A signal that cuts play short anywhere may come while an object is deleted, where its exception is lost.
-        with StopSignal() as stop:
+    with StopSignal(deferred=False) as stop:
+        try:
             for tick in ticks(policy, world, job.episodes, camera=True, run_seed=job.seed):
+                stop.deferred = True
                 recorder.write(tick)
+                stop.deferred = False
+                # What a signal's handler raises while an object is deleted is lost; the signal is not.
                 stop.check()
                 ended = int((tick.solved | tick.truncated).sum())
                 if ended:
                     on_end(ended)
-    finally:
-        with StopSignal():
+        finally:
+            stop.deferred = True
             recorder.close()
+        stop.check()
     world.close()
     return recorder.ticks
 

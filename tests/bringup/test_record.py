@@ -1,0 +1,64 @@
+"""Interrupted recordings in this process, at moments that no signal from outside meets reliably."""
+
+import signal
+
+import pytest
+
+from bringup.command import Choice, Stack
+from bringup.record import Job, MixedEpisodes, record
+from mujoban_core.plugins import ROLES
+from mujoban_core.signals import Interrupted, interruptible
+from mujoban_msgs_py import topics
+from mujoban_msgs_py.bags.training import find_bags, open_training_bag
+from mujoban_sokoban.generator import TRAIN_SEEDS
+
+BATCH = 4
+
+
+class Signalling(MixedEpisodes):
+    """Episodes that ask the process to end while the second of their levels is drawn."""
+
+    def __init__(self, lost: bool) -> None:
+        super().__init__(BATCH, TRAIN_SEEDS.start, [1])
+        self.lost, self.drawn = lost, []
+
+    def _make(self, index):
+        self.drawn.append(index)
+        if index == 1:
+            if self.lost:
+                Farewell()
+            else:
+                signal.raise_signal(signal.SIGTERM)
+        return super()._make(index)
+
+
+class Farewell:
+    """Is deleted while a signal comes."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+
+@pytest.fixture
+def interrupted(tmp_path):
+    def play(episodes):
+        stack = Stack({role: Choice(role, "oracle") for role in ROLES})
+        job = Job(tmp_path / "bags", "", episodes, stack, None, BATCH, 50, 0)
+        with interruptible(), pytest.raises(Interrupted):
+            record(job)
+        return job.out
+
+    return play
+
+
+def test_a_recording_that_is_interrupted_while_levels_are_drawn_draws_no_others(interrupted):
+    episodes = Signalling(lost=False)
+    interrupted(episodes)
+    assert episodes.drawn == [0, 1], "hard levels take seconds each"
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interruption_that_is_lost_in_a_destructor_ends_the_recording_after_a_tick(interrupted):
+    bags = find_bags([interrupted(Signalling(lost=True))])
+    ticks = [open_training_bag(bag, [topics.TORQUE]).topics[topics.TORQUE.name].count for bag in bags]
+    assert ticks == [1] * BATCH
