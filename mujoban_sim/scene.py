@@ -224,7 +224,7 @@ class SceneCache:
     A batch keeps the models that it runs on alive itself, so dropping one here is always safe.
     """
 
-    def __init__(self, body: Body, max_boxes: int, preset: WorldPreset, capacity: int = 1024) -> None:
+    def __init__(self, body: Body, max_boxes: int, preset: WorldPreset, capacity: int = 32) -> None:
         """Compile models of a world for `body` and layouts of `max_boxes` boxes; keep at most `capacity` of them."""
         if capacity < 1:
             raise ValueError(f"capacity of the scene cache is {capacity}: expected at least 1")
