@@ -183,7 +183,7 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
         try:
             for tick in ticks(policy, world, job.episodes, camera=True, run_seed=job.seed):
                 stop.deferred = True
-                recorder.write(tick)
+                recorder.write(tick, stop.check)
                 stop.deferred = False
                 # What a signal's handler raises while an object is deleted is lost; the signal is not.
                 stop.check()

@@ -6,7 +6,7 @@ log time. Only the view from above is left out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,9 +92,15 @@ class Recorder:
             for row in self._rows.values():
                 closing.callback(row.writer.close)
 
-    def write(self, tick: Tick) -> None:
-        """Write one tick of every row in which an episode runs."""
+    def write(self, tick: Tick, check: Callable[[], None] = lambda: None) -> None:
+        """Write one tick of every row in which an episode runs.
+
+        Args:
+            tick: The tick.
+            check: Called before each row; all bags are whole also where it raises.
+        """
         for m, number in enumerate(tick.rows.tolist()):
+            check()
             if number not in self._rows:
                 path = self._path / f"{self._prefix}row{number:03d}"
                 writer = BagWriter(
@@ -103,7 +109,7 @@ class Recorder:
                 )  # fmt: skip
                 self._rows[number] = _Row(writer, TickComposer(self._body))
             self._write_row(self._rows[number], tick, m)
-        self.ticks += len(tick.rows)
+            self.ticks += 1
 
     def _write_row(self, row: _Row, tick: Tick, m: int) -> None:
         if tick.step[m] == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +26,7 @@ _DIGEST: Final = "sha256/"
 """Beginning of the keys of the files' checksums in the custom data."""
 _ABOUT: Final = "mujoban/"
 """Beginning of the keys of `Metadata.about` in the custom data."""
-_OWN_DIGEST: Final = "mujoban_sha256"
+_OWN_DIGEST: Final = "mujoban_metadata_sha256"
 """Key of the checksum of all else in the file."""
 _FOREVER: Final = {"sec": 9223372036, "nsec": 854775807}
 
@@ -167,7 +168,7 @@ def _dump(content: object) -> str:
 
 
 def _digest(information: Mapping[str, Any]) -> str:
-    return hashlib.sha256(_dump(information).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(information).encode()).hexdigest()
 
 
 def dump_qos(profiles: Sequence[Mapping[str, Any]]) -> str:

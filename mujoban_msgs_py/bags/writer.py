@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.integrity import IDENTITY, LAST, HashedFile, Identity, Reserve, dump_identity
 from mujoban_msgs_py.bags.metadata import FileRecord, Metadata, TopicRecord, dump_qos, qos_profile
-from mujoban_msgs_py.bags.types import TypeRegistry
+from mujoban_msgs_py.bags.types import known_types
 from mujoban_msgs_py.topics import Topic
 
 CHUNK_SIZE: Final = 1 << 20
@@ -71,7 +71,7 @@ class BagWriter:
         self._episodes_per_file = episodes_per_file
         self._chunk_size = chunk_size
         self._compression = _COMPRESSION[compression]
-        self._types = TypeRegistry()
+        self._types = known_types()
         self._metadata = Metadata(bag=secrets.token_hex(16), about=dict(about or {}))
         self._flush_after = flush_after
         self._stamps: set[int] = set()
@@ -89,10 +89,9 @@ class BagWriter:
         except OSError:
             self.path.rmdir()
             raise
-        self._open_file()
         for topic in topics:
-            self._add(topic.name, topic.type_name, [qos_profile(latched=topic.latched)])
-        self._write_metadata()
+            self._note(topic.name, topic.type_name, [qos_profile(latched=topic.latched)])
+        self._open_file()
 
     @property
     def closed(self) -> bool:
@@ -111,17 +110,17 @@ class BagWriter:
             BagError: If the type is unknown, or the topic is in the bag with another type.
         """
         if name not in self._metadata.topics:
-            self._add(name, type_name, qos)
+            self._register(self._note(name, type_name, qos))
             self._write_metadata()
         elif self._metadata.topics[name].type_name != type_name:
             known = self._metadata.topics[name].type_name
             raise BagError(f"topic {name} of {self.path} is of type {known}, not {type_name}")
 
-    def _add(self, name: str, type_name: str, qos: Sequence[Mapping[str, Any]]) -> None:
+    def _note(self, name: str, type_name: str, qos: Sequence[Mapping[str, Any]]) -> TopicRecord:
         profiles = [dict(p) for p in qos] or [qos_profile()]
         record = TopicRecord(name, type_name, self._types.type_hash(type_name), profiles)
         self._metadata.topics[name] = record
-        self._register(record)
+        return record
 
     def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
         """Write one serialised message.

@@ -55,7 +55,7 @@ def edit(bag, change):
     path = bag / "metadata.yaml"
     content = yaml.safe_load(path.read_text())
     information = content["rosbag2_bagfile_information"]
-    information["custom_data"].pop("mujoban_sha256")
+    information["custom_data"].pop("mujoban_metadata_sha256")
     change(information)
     path.write_text(yaml.safe_dump(content, sort_keys=False))
 
