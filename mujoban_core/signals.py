@@ -63,11 +63,11 @@ def interruption(error: BaseException) -> KeyboardInterrupt | None:
 
 
 def leave(status: int) -> NoReturn:
-    """End the process once what was registered with `atexit` has run.
+    """End the process once what was registered with `atexit` has run; nobody waits for what workers have not begun.
 
     The interpreter is not taken down in order: with PyTorch and ROS in it that takes seconds on a busy machine.
     """
-    end_workers()
+    end_workers(drop=True)
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):  # a terminal that was closed, a pipe whose reader has left

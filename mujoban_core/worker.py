@@ -6,7 +6,8 @@ import threading
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
-from queue import SimpleQueue
+from contextlib import suppress
+from queue import Empty, SimpleQueue
 from typing import ParamSpec, TypeVar
 
 _P = ParamSpec("_P")
@@ -40,6 +41,12 @@ class Worker:
         self._jobs.put(job)
         return future
 
+    def drop(self) -> None:
+        """Forget what has not begun; nobody is told."""
+        with suppress(Empty):
+            while True:
+                self._jobs.get_nowait()
+
     def end(self) -> None:
         """Let the thread end after what was submitted, without waiting for it."""
         self._jobs.put(None)
@@ -57,9 +64,15 @@ def _work(jobs: SimpleQueue[Callable[[], None] | None]) -> None:
 _WORKERS: weakref.WeakSet[Worker] = weakref.WeakSet()
 
 
-def end_workers() -> None:
-    """Let what was submitted finish before the interpreter goes: a library must not be cut off in the middle."""
+def end_workers(*, drop: bool = False) -> None:
+    """Let what was submitted finish before the interpreter goes: a library must not be cut off in the middle.
+
+    Args:
+        drop: Whether only what has begun is finished.
+    """
     for worker in list(_WORKERS):
+        if drop:
+            worker.drop()
         worker.end()
         worker.join()
 

@@ -57,3 +57,12 @@ def test_workers_end_before_the_libraries_that_they_use(end):
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert ended.stdout.split() == ["finished", "library"], ended.stderr
+
+
+def test_a_program_that_leaves_does_not_wait_for_what_has_not_begun():
+    code = (
+        "import time; from mujoban_core.signals import leave; from mujoban_core.worker import Worker; w = Worker('w');"
+        " [w.submit(lambda k=k: (time.sleep(0.3), print(k, flush=True))) for k in range(99)]; time.sleep(0.1); leave(0)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=20)
+    assert ended.stdout == "0\n", ended.stderr
