@@ -25,7 +25,7 @@ _REFERENCE: Final = re.compile(r"^\s*([A-Za-z]\w*)/(?:msg/)?([A-Z]\w*)(?:\[[^\]]
 
 @cache
 def known_types() -> TypeRegistry:
-    """Return the registry that this process's writers share: to make one takes 20 ms."""
+    """Return the registry that bags without definitions of their own share in this process: to make one takes 20 ms."""
     return TypeRegistry()
 
 
