@@ -25,6 +25,8 @@ STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _COMPILERS: Final = ("numba", "llvmlite")
 _LATER: Final = 0.05
 """Seconds after which a signal that was put off comes again."""
+_LOST: Final = 0.3
+"""Seconds after which an interruption that has not left its context is looked after."""
 AGAIN: Final = 0.5
 """Seconds after the first signal from which on another SIGINT is a second one; runners that pass on what the terminal
 has sent already, such as make, deliver one twice."""
@@ -77,17 +79,51 @@ def leave(status: int) -> NoReturn:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise `Interrupted` in the main thread where a signal asks the process to end."""
+    """Raise `Interrupted` in the main thread where a signal asks the process to end.
 
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        if not _put_off(number, frame):
-            raise Interrupted(number)
-
-    before = _handle(interrupt)
+    What a handler raises while an object is deleted, or where a library calls back, is lost; then it is raised again.
+    """
+    insisting = _Insisting()
+    before = _handle(insisting.interrupt)
     try:
         yield
     finally:
+        insisting.end()
         _put_back(before)
+
+
+class _Insisting:
+    """Raises `Interrupted`, and has the signal sent again until that is on its way out of the context."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._ended = False
+
+    def interrupt(self, number: int, frame: FrameType | None) -> None:
+        if _is_raised() or _put_off(number, frame):
+            return
+        timer = threading.Timer(_LOST, self._send, (number,))
+        timer.daemon = True
+        timer.start()
+        raise Interrupted(number)
+
+    def _send(self, number: int) -> None:
+        with self._lock:
+            if not self._ended:
+                os.kill(os.getpid(), number)
+
+    def end(self) -> None:
+        """Send nothing any more."""
+        with self._lock:
+            self._ended = True
+
+
+def _is_raised() -> bool:
+    """Tell whether an interruption is being put away just now: in a `finally`, an `except`, at the end of a `with`."""
+    error = sys.exc_info()[1]
+    while error is not None and not isinstance(error, Interrupted):
+        error = error.__context__
+    return error is not None
 
 
 _Handler = Callable[[int, FrameType | None], object] | int | None

@@ -70,6 +70,30 @@ def test_outside_of_such_work_a_signal_interrupts():
     assert raised.value.number == signal.SIGTERM
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interruption_that_is_lost_while_an_object_is_deleted_comes_again():
+    class Asked:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+
+    with interruptible(), pytest.raises(Interrupted):
+        Asked()
+        time.sleep(20)
+
+
+def test_what_puts_an_interruption_away_is_not_cut_short():
+    put_away = []
+    with pytest.raises(Interrupted), interruptible():
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        finally:
+            time.sleep(1.0)
+            put_away.append("the first")
+    assert put_away
+    time.sleep(0.5)  # nothing more comes, when nobody would handle it
+
+
 def test_a_hang_up_that_is_ignored_stays_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
