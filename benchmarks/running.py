@@ -36,13 +36,19 @@ class Run:
         self.process = subprocess.Popen(
             command, cwd=folder, env={**os.environ, **(environment or {})},
             stdin=theirs if terminal else subprocess.DEVNULL, stdout=theirs, stderr=theirs, start_new_session=True,
-            preexec_fn=(lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0)) if terminal else None,
+            preexec_fn=self._prepare,
         )  # fmt: skip
         os.close(theirs)
         self._said = bytearray()
         self._hung_up = threading.Event()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+
+    def _prepare(self) -> None:
+        """In the child: take the terminal, and hear hang-ups, which nohup has all that it starts ignore."""
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        if self.terminal:
+            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
     @property
     def said(self) -> str:
