@@ -12,6 +12,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 
 from mujoban_msgs_py.listening import Received, listen
+from mujoban_msgs_py.run_identifier import run_of
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.topics import EPISODE, GRAPH_TOPICS, MONITORED, RECORDED, TICK, Topic
 
@@ -136,6 +137,6 @@ class Vandal(Node):
         self._last[topic.name] = message.raw
         # It hears itself as well: the run goes on where /episode has a later tick, and one that can follow.
         follows = not self._tick or self._tick < message.stamp <= self._tick + _STEPS * TICK
-        if topic is EPISODE and follows and message.stamp % TICK == 0:
+        if topic is EPISODE and follows and (not self._tick or run_of(message.stamp) == run_of(self._tick)):
             self._tick = message.stamp
             self.heard += 1

@@ -14,7 +14,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.listening import Received, listen
-from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
 
@@ -37,6 +37,7 @@ class RecorderNode(Node):
         episodes_per_file: Episodes after which the next file of the bag begins.
         instructed: Whether four modules play; if not, an agent, of which there are torques alone.
         body, world: Of the robot and of the physics, which the bag names; empty: it does not.
+        run: Identifier of the run that is recorded; -1 for any.
 
     Attributes:
         counts: Messages that were never received, or belong to no tick of the simulator, by topic.
@@ -59,6 +60,7 @@ class RecorderNode(Node):
             "body": declare(self, "body", "", described("the robot's body, for the bag to name", fixed=True)),
             "world": declare(self, "world", "", described("the physical world, for the bag to name", fixed=True)),
         }
+        self.run = declare_run(self)
         self.counts: Counter[str] = Counter()
         self._bag = BagWriter(
             Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file, flush_after=FLUSH_AFTER,

@@ -38,10 +38,10 @@ from mujoban_core.plugins import ROLES
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
-from mujoban_msgs_py.listening import reject
+from mujoban_msgs_py.listening import belongs, reject
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime import diagnostics
-from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK, Topic
@@ -86,11 +86,13 @@ class LiveNode(Node):
         address: IP address on which stream and page are served; 0.0.0.0 for every interface.
         grpc_port: Port on which the stream is served, or the next free one.
         web_port: Port on which the viewer's page is served, or the next free one.
+        run: Identifier of the run that is shown; -1 for any.
     """
 
     def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Open the stream and start listening."""
         super().__init__("live", **options)
+        self.run = declare_run(self)
         self.counts: Counter[str] = Counter()
         save = declare(self, "save", "", described("recording (.rrd) to write; empty: a page is served", fixed=True))
         address = declare(self, "address", LOOPBACK, described("IP address of the page; 0.0.0.0: all", fixed=True))
@@ -147,6 +149,8 @@ class LiveNode(Node):
                 content = read(message, topic.type, check) if is_shown else None
             except ValueError as error:
                 reject(self, topic.name, error)
+                return
+            if not belongs(self, topic.name, stamp):
                 return
             self._stream.set_time("simulated_time", duration=stamp / 1e9)
             self._log_time(topic, _Received(stamp, at))

@@ -18,16 +18,14 @@ from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.plugins import AGENT
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
-from mujoban_msgs_py.listening import PublisherWatch, Received, listen
+from mujoban_msgs_py.listening import PublisherWatch, Received, listen, refuse_run
+from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.ending_node import EndingNode
 from mujoban_msgs_py.runtime.tick_node import live_qos
-from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_sokoban.episodes import Episodes
 
-ANOTHER_RUN: Final = "messages of another run"
-"""Kind under which `MonitorNode.counts` has what was refused."""
 _AHEAD: Final = 100 * topics.TICK
 """Simulated time [ns] by which modules may be heard before the simulator; what is further ahead is a stranger's."""
 _WATCHED = (topics.INSTRUCTION, topics.TERMINATION, topics.ABSTRACT_STATE, topics.TRUE_ABSTRACT_STATE)
@@ -83,19 +81,22 @@ class MonitorNode(EndingNode):
         finished: Done when all episodes have ended.
         ticks: Ticks that the graph has answered.
         counts: Events that a user should know of.
+        run: Identifier of the run that is watched.
     """
 
     def __init__(
-        self, episodes: Episodes, *, alone: bool = False, **options: Unpack[NodeOptions]
+        self, episodes: Episodes, *, alone: bool = False, run: int = ANY, **options: Unpack[NodeOptions]
     ) -> None:
         """Watch until as many episodes have ended; what another run says of its own is no result of this one.
 
         Args:
             episodes: Which are played.
             alone: Whether an agent plays alone, without modules.
+            run: Identifier of the run, if it is known.
             **options: Of the node.
         """
         super().__init__("monitor", **options)
+        self.run = run
         self.episode: EpisodeTruth | None = None
         self.latest: Watched | None = None
         self.results: list[EpisodeResult] = []
@@ -140,12 +141,7 @@ class MonitorNode(EndingNode):
     def _on_episode(self, received: Received) -> None:
         message: EpisodeTruth = received.content
         if message.seed not in self._episodes.seeds or message.difficulty != self._episodes.difficulty:
-            self.counts[ANOTHER_RUN] += 1
-            if is_due(self, ANOTHER_RUN):
-                self.get_logger().error(
-                    f"another run is in this ROS domain: it plays seed {message.seed} at difficulty "
-                    f"{message.difficulty}, which is none of this run's"
-                )
+            refuse_run(self, f"it plays seed {message.seed} at difficulty {message.difficulty}")
             return
         if self._end is not None and message.episode == self._end.episode:
             # The episode goes on, so that its end was not the simulator's word.

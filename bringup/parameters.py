@@ -37,15 +37,17 @@ def write_parameters(parameters: Parameters, path: Path) -> None:
     path.write_text(yaml.safe_dump({node: {"ros__parameters": values} for node, values in parameters.items()}))
 
 
-def graph_parameters(stack: Player, episodes: Episodes, **simulator: Any) -> Parameters:
+def graph_parameters(stack: Player, episodes: Episodes, *, run: int = 0, **simulator: Any) -> Parameters:
     """Return the parameters of a graph that plays some episodes with some modules, or with an agent alone.
 
     Args:
         stack: The modules, or the agent.
         episodes: The episodes.
+        run: Its identifier, see `mujoban_msgs_py.run_identifier`.
         **simulator: Further parameters of the simulator.
     """
     parameters = read_parameters()
+    parameters["simulator"]["run"] = run
     parameters["simulator"] |= {
         "body": stack.body,
         "seed": episodes.seed,
@@ -57,9 +59,9 @@ def graph_parameters(stack: Player, episodes: Episodes, **simulator: Any) -> Par
         parameters["simulator"]["difficulty"] = episodes.difficulty
     if isinstance(stack, Solo):
         parameters["simulator"]["instructed"] = False
-        return {"simulator": parameters["simulator"], AGENT: _loaded(stack.choice, stack)}
+        return {"simulator": parameters["simulator"], AGENT: {"run": run, **_loaded(stack.choice, stack)}}
     for role in ROLES:
-        parameters[role] |= _loaded(stack.choices[role], stack)
+        parameters[role] |= {"run": run, **_loaded(stack.choices[role], stack)}
     if simulator.get("realtime"):
         parameters["termination"]["patience"] = 1
     for role in LOOKING_ROLES:

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -28,6 +28,8 @@ from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.plugins import AGENT, ROLES
 from mujoban_core.signals import StopSignal
 from mujoban_core.threads import set_threads
+from mujoban_msgs_py.run_identifier import ANY, draw_run
+from mujoban_msgs_py.runtime.discovery import reaches_further
 from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
 from mujoban_msgs_py.runtime.tick_node import ros_context, spin
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -35,6 +37,11 @@ from mujoban_sokoban.episodes import Episodes
 
 DRAIN_TIMEOUT = 5.0
 """Seconds that recorder and video have for the last tick."""
+
+
+def _run() -> int:
+    """Return the identifier of a run: drawn where it may meet others; on this host it has a domain of its own."""
+    return draw_run() if reaches_further() else 0
 
 
 @dataclass(frozen=True)
@@ -57,6 +64,8 @@ class PlayOptions:
     """Video file to write."""
     view: str | None = None
     """IP address on which a live view is served to the browser, from a process of its own."""
+    run: int = field(default_factory=_run)
+    """Its identifier, which keeps it apart from other runs, see `mujoban_msgs_py.run_identifier`."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +105,7 @@ def play(
     parameters = graph_parameters(
         stack,
         episodes,
+        run=options.run,
         world=options.world,
         realtime=options.realtime,
         time_limit=options.time_limit or 0,
@@ -112,15 +122,15 @@ def play(
         alone = isinstance(stack, Solo)
         for role in () if options.processes else (AGENT,) if alone else ROLES:
             check_body(role, graph.nodes[role].module, stack.body)  # pyright: ignore[reportAttributeAccessIssue]
-        monitor = graph.add(MonitorNode(episodes, alone=alone))
+        monitor = graph.add(MonitorNode(episodes, alone=alone, run=options.run))
         stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:
             listeners.append(graph.add(_recorder(options.record, options, stack.body, instructed=not alone)))
         if options.video is not None:
-            listeners.append(graph.add(VideoNode(options.video, alone=alone)))
+            listeners.append(graph.add(VideoNode(options.video, alone=alone, run=options.run)))
         if options.view is not None:
-            exits.enter_context(viewer(options.view))
+            exits.enter_context(viewer(options.view, options.run))
         if options.processes:
             processes = exits.enter_context(Processes(parameters))
             monitor.watch.ghosts = processes.ghosts
@@ -164,18 +174,20 @@ def _drain(executor: Executor, listeners: Sequence[RecorderNode | VideoNode], st
 
 
 @contextmanager
-def viewer(address: str) -> Iterator[None]:
+def viewer(address: str, run: int = ANY) -> Iterator[None]:
     """Run `bringup.live` in a process of its own: drawing must not hold up the graph.
 
     Args:
         address: IP address on which it is served.
+        run: Identifier of the run that it shows.
 
     Raises:
         ValueError: If Rerun is not installed.
     """
     if find_spec("rerun") is None:
         raise ValueError("the live view needs rerun-sdk: pip install 'mujoban[view]'")
-    process = children.start([sys.executable, "-m", "bringup.live", "--ros-args", "-p", f"address:='{address}'"])
+    settings = ("-p", f"address:='{address}'", "-p", f"run:={run}")
+    process = children.start([sys.executable, "-m", "bringup.live", "--ros-args", *settings])
     try:
         yield
     finally:
@@ -185,6 +197,6 @@ def viewer(address: str) -> Iterator[None]:
 def _recorder(path: Path, options: PlayOptions, body: str, *, instructed: bool) -> RecorderNode:
     values = {
         "path": str(path), "episodes_per_file": options.episodes_per_file, "body": body, "world": options.world,
-        "instructed": instructed,
+        "instructed": instructed, "run": options.run,
     }  # fmt: skip
     return RecorderNode(parameter_overrides=[Parameter(name, value=value) for name, value in values.items()])

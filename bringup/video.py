@@ -20,6 +20,7 @@ from bringup.overlay import Said, draw
 from mujoban_core.grid import CONTROL_PERIOD
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
+from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
@@ -58,12 +59,13 @@ class VideoNode(Node):
         written: Stamp of the latest picture [ns].
     """
 
-    def __init__(self, path: Path, *, alone: bool = False, **options: Unpack[NodeOptions]) -> None:
+    def __init__(self, path: Path, *, alone: bool = False, run: int = ANY, **options: Unpack[NodeOptions]) -> None:
         """Open the file.
 
         Args:
             path: Of the video.
             alone: Whether an agent plays alone, and there are no modules whose word could be waited for.
+            run: Identifier of the run that is filmed, if it is known.
             **options: Of the node.
 
         Raises:
@@ -71,6 +73,7 @@ class VideoNode(Node):
             OSError: If its folder does not exist.
         """
         super().__init__("video", **options)
+        self.run = run
         self.counts: Counter[str] = Counter()
         if path.suffix != ".mp4":
             raise ValueError(f"{path}: expected a file name that ends in .mp4")

@@ -17,6 +17,7 @@ from rclpy.subscription import Subscription
 
 from mujoban_msgs_py.decoders import DECODERS, Decode
 from mujoban_msgs_py.raw import Steady, raw_stamp, read
+from mujoban_msgs_py.run_identifier import ANY, run_of
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.topics import PUBLISHERS, Topic
 
@@ -31,6 +32,8 @@ _PATIENCE: Final = 5
 """Looks in a row for which a publisher may be without a name."""
 REJECTED: Final = "rejected messages"
 """Kind under which `Listener.counts` has what was dropped."""
+ANOTHER_RUN: Final = "messages of another run"
+"""Kind under which it has what is sound, but not of the run that the node belongs to."""
 
 
 class Received(NamedTuple):
@@ -56,7 +59,8 @@ def listen(
     """Subscribe to a topic of the graph.
 
     Args:
-        node: Who listens; if it has `counts`, what is dropped is counted there under `REJECTED`.
+        node: Who listens; if it has `counts`, what is dropped is counted there under `REJECTED`. If it has a `run`, it
+            hears that one alone.
         topic: The topic.
         receive: Called with every message that is sound.
         qos: The topic's own by default.
@@ -73,7 +77,8 @@ def listen(
         except ValueError as error:
             reject(node, topic.name, error)
             return
-        receive(Received(stamp, content, message))
+        if belongs(node, topic.name, stamp):
+            receive(Received(stamp, content, message))
 
     return node.create_subscription(topic.type, topic.name, on_message, qos or topic.qos, raw=True)
 
@@ -83,6 +88,22 @@ def reject(node: Node, topic: str, reason: object) -> None:
     _count(node, REJECTED)
     if is_due(node, topic):
         node.get_logger().error(f"rejected a message on {topic}: {' '.join(str(reason).split())}")
+
+
+def belongs(node: Node, topic: str, stamp: int) -> bool:
+    """Tell whether a message of a stamp [ns] is of the run that a node belongs to; if not, count and report it."""
+    run = getattr(node, "run", ANY)
+    if run in (ANY, run_of(stamp)):
+        return True
+    refuse_run(node, f"{topic} has messages of run {run_of(stamp)}")
+    return False
+
+
+def refuse_run(node: Node, what: str) -> None:
+    """Count a message of another run, and say what it was, at most once per `LOG_PERIOD`."""
+    _count(node, ANOTHER_RUN)
+    if is_due(node, ANOTHER_RUN):
+        node.get_logger().error(f"another run is in this ROS domain: {what}, which is none of this run's")
 
 
 def _count(node: Node, kind: str) -> None:

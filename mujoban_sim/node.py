@@ -21,7 +21,7 @@ from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES, FASTEST
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
-from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.ending_node import EndingNode
 from mujoban_msgs_py.runtime.kept import KeptArrays
@@ -87,6 +87,7 @@ class SimulatorNode(EndingNode):
         await_recorder, await_monitor: Whether a tick, in real time the first, waits until that one has acknowledged it.
         instructed: Whether instructions come with the torques; those who play without modules send torques alone.
         top_camera_size: Pixels along the edge of `/camera_top/image_raw`, which is drawn while it has a reader.
+        run: Identifier of the run, from 0 on: nanoseconds of simulated time at which it begins.
         resume_file: Where the node keeps every tick that it offers, to go on from after a crash; empty means nowhere.
 
     Services: `/reset` starts the episode again, `/pause` (true or false) holds the world, `/step` advances it a tick.
@@ -110,6 +111,7 @@ class SimulatorNode(EndingNode):
         self.counts: Counter[str] = Counter()
         self.finished, self.ticks = Future(), 0
         self._settings: dict[str, Any] = {name: declare(self, name, *about) for name, about in PARAMETERS.items()}
+        self.run = declare_run(self, 0)
         self.episodes = self._read_episodes()
         self.world = World(
             1,
@@ -122,7 +124,7 @@ class SimulatorNode(EndingNode):
         if not self._speed >= 0:
             raise ValueError(f"realtime is {self._speed}: expected a speed above 0, or 0 for lockstep")
         self._observation = ObservationPublisher(self, self.world, self._settings["top_camera_size"])
-        self._place = Place()
+        self._place = Place(stamp=self.run)
         self._torque: NDArray[np.float32] | None = None
         self._held_torque = np.zeros(self.world.body.action_size, np.float32)
         self._instruction: conversions.InstructionReading | None = None
@@ -138,7 +140,7 @@ class SimulatorNode(EndingNode):
         self._resumed = self._restore()
         # What is missing to draw with shows now, and the first tick is as quick as the others.
         self.world.render()
-        self._pace = Pace(self._speed, self._settings["resend_after"], self._settings["hold_limit"])
+        self._pace = Pace(self._speed, self._settings["resend_after"], self._settings["hold_limit"], newest=self.run)
         self._listen()
         report_on(self, self._condition)
         self._start_timer = self.create_timer(MATCH_PERIOD, self._start_when_complete)
@@ -341,7 +343,7 @@ class SimulatorNode(EndingNode):
 
     def _is_known(self, stamp: int, topic: str) -> bool:
         """Tell whether a stamp is that of a tick of this run; repeated answers to earlier ticks are."""
-        if 0 < stamp <= self._stamp and stamp % TICK == 0:
+        if self.run < stamp <= self._stamp:
             return True
         self._reject("messages of an unknown episode", f"{topic}: stamp {stamp} ns belongs to no episode of this run")
         return False

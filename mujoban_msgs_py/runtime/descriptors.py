@@ -9,6 +9,9 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from mujoban_msgs_py.run_identifier import ANY
+from mujoban_msgs_py.topics import TICK
+
 ValueT = TypeVar("ValueT", bool, int, float, str)
 
 
@@ -47,3 +50,13 @@ def declare(node: Node, name: str, default: ValueT, descriptor: ParameterDescrip
         ParameterException: If it was given a value of another type, or out of its range.
     """
     return cast(ValueT, node.declare_parameter(name, default, descriptor).value)
+
+
+def declare_run(node: Node, default: int = ANY) -> int:
+    """Declare the parameter `run` of a node and return the identifier of the run that it belongs to.
+
+    Raises:
+        ParameterException: If it is out of its range; `ANY` is in it where that is the default.
+    """
+    about = described("identifier of the run; -1: of any", fixed=True, low=min(default, 0), high=TICK - 1)
+    return declare(node, "run", default, about)

@@ -12,6 +12,13 @@ LOOPBACK: Final = Path(__file__).with_name("loopback.xml")
 _FAST_DDS: Final = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
 
 
+def reaches_further() -> bool:
+    """Tell whether nodes may reach beyond this host, by the environment before or after `confine_discovery`."""
+    confined = {"LOCALHOST", "SYSTEM_DEFAULT"} if PROFILES in os.environ else {"LOCALHOST"}
+    ours = os.environ.get(PROFILES, str(LOOPBACK)) == str(LOOPBACK)
+    return not (ours and os.environ.get(RANGE, "LOCALHOST") in confined)
+
+
 def confine_discovery() -> None:
     """Keep ROS on this host's loopback interface, for child processes as well; call before rclpy is initialised.
 

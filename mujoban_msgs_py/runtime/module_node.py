@@ -19,7 +19,7 @@ from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
 from mujoban_core.plugins import LEARNED, PRIVILEGED, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS, Condition
 from mujoban_msgs_py.runtime.kept import KeptArrays, leaves, with_leaves
 from mujoban_msgs_py.runtime.tick_node import Input, Output, TickNode
@@ -53,6 +53,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         device: Device of the learned module; setting it loads the weights again.
         threads: Threads of PyTorch in this process; at batch 1 further ones gain little on an idle machine, and on a
             busy one they wait for each other. Fixed when the node starts.
+        run: Identifier of the run that the module answers; -1 for any. Fixed when the node starts.
         run_seed: Seed of the module's random streams, one for each number of an episode; fixed when the node starts.
         look_around: Of planner and controller alone: ticks of a look, which is a turn on the spot; 0 for none. Fixed
             when the node starts.
@@ -72,6 +73,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
             ValueError: If the module or its weights cannot be loaded, or `resume_file` is none.
         """
         super().__init__(self.role, **options)
+        self.run = declare_run(self)
         set_threads(declare(self, "threads", 1, described("of PyTorch", fixed=True)))
         which = described("learned, oracle or package.module:Class", fixed=True)
         self._source = declare(self, "module", LEARNED, which)

@@ -32,8 +32,9 @@ from rclpy.task import Future
 from mujoban_core.children import end_with_parent
 from mujoban_core.signals import StopSignal, interruptible
 from mujoban_msgs_py.decoders import checked
-from mujoban_msgs_py.listening import reject
+from mujoban_msgs_py.listening import belongs, reject
 from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.discovery import confine_discovery
@@ -72,9 +73,11 @@ class TickNode(EndingNode):
     Attributes:
         counts: Events that a user should know of, such as rejected messages.
         patience: Offers of the same tick until `answer` is told that waiting will not help.
+        run: Identifier of the run that it answers.
     """
 
     patience = PATIENCE
+    run = ANY
 
     def __init__(self, name: str, **options: Unpack[NodeOptions]) -> None:
         """Make the node; `open_inputs` starts it."""
@@ -166,6 +169,8 @@ class TickNode(EndingNode):
             item = read(message, topic.type, decode)
         except ValueError as error:
             reject(self, topic.name, error)
+            return
+        if not belongs(self, topic.name, stamp):
             return
         if topic is EPISODE:
             self._note_offer(stamp, item)

@@ -71,7 +71,7 @@ class Play:
         self.graph = InProcess(self.parameters, ())
         self._open = True
         self.tap = self.graph.add(Tap())
-        self.monitor = self.graph.add(MonitorNode(episodes))
+        self.monitor = self.graph.add(MonitorNode(episodes, run=self.parameters["simulator"]["run"]))
         for name in names:
             self.graph.start(name)
 

@@ -12,12 +12,11 @@ from std_msgs.msg import String
 
 from benchmarks.malformed import TARGETS, Vandal
 from bringup.graph_recorder import RecorderNode
-from bringup.monitor import ANOTHER_RUN
 from bringup.viz import VizNode
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.decoders import DECODERS
-from mujoban_msgs_py.listening import Received, reject
+from mujoban_msgs_py.listening import ANOTHER_RUN, Received, reject
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import generate_level
 

@@ -23,6 +23,8 @@ from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.listening import ANOTHER_RUN
+from mujoban_msgs_py.run_identifier import run_of
 from mujoban_msgs_py.topics import TICK
 from mujoban_sim.node import PARAMETERS, SimulatorNode
 from mujoban_sokoban.episodes import Episodes
@@ -229,10 +231,33 @@ def test_a_torque_of_an_unknown_episode_is_counted_and_changes_nothing(play_grap
     graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
     publisher = graph.tap.create_publisher(JointState, topics.TORQUE.name, topics.TORQUE.qos)
     graph.spin_until(lambda: graph.simulator.ticks >= 2)
-    for stamp in (TICK // 2, 10**15):
+    for stamp in (TICK // 2, 0, 10**15):
         publisher.publish(JointState(header=conversions.header(stamp), effort=[1.0, 1.0]))
     graph.spin_until(lambda: graph.simulator.counts["messages of an unknown episode"] == 2)
+    assert graph.simulator.counts[ANOTHER_RUN] == 1
     assert graph.finish()[0].solved
+
+
+def test_two_runs_in_one_domain_leave_each_other_alone(play_graph, fresh_weights, capfd):
+    stack = Stack(fresh_weights.choices | {"planner": Choice("planner")}, look_around=5)
+    runs = {7: Episodes(1, 5, difficulty=3), TICK - 1: Episodes(1, 6, difficulty=3)}
+    alone = {}
+    for run, episodes in runs.items():
+        graph = play_graph(stack, episodes, time_limit=30, run=run)
+        alone[run] = graph.finish(), graph.said.estimate
+        graph.__exit__(None, None, None)
+    graphs = {run: play_graph(stack, episodes, time_limit=30, run=run) for run, episodes in runs.items()}
+    deadline = time.monotonic() + 60.0
+    while not all(graph.monitor.finished.done() for graph in graphs.values()):
+        assert time.monotonic() < deadline, "the graphs stand still"
+        for graph in graphs.values():
+            graph.graph.executor.spin_once(timeout_sec=0.01)
+    for run, graph in graphs.items():
+        estimates = {stamp: raw for stamp, raw in graph.said.estimate.items() if run_of(stamp) == run}
+        assert (graph.monitor.results, estimates) == alone[run]
+        for node in (graph.monitor, *graph.graph.nodes.values()):
+            assert node.counts[ANOTHER_RUN] > 0, f"{node.get_name()} has not noticed the other run"
+    assert re.search("another run is in this ROS domain: /[a-z_/]+ has messages of run 7", capfd.readouterr().err)
 
 
 def test_an_image_of_wrong_size_or_encoding_is_rejected_and_counted(play_graph):

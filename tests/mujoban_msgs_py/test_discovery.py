@@ -21,19 +21,23 @@ time.sleep(60)
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
+    ("given", "expected", "further"),
     [
-        ({}, {RANGE: "SYSTEM_DEFAULT", PROFILES: str(LOOPBACK)}),
-        ({RANGE: "SUBNET"}, {RANGE: "SUBNET"}),
-        ({PROFILES: "mine.xml"}, {PROFILES: "mine.xml", RANGE: "LOCALHOST"}),
-        ({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, {RANGE: "LOCALHOST"}),
+        ({}, {RANGE: "SYSTEM_DEFAULT", PROFILES: str(LOOPBACK)}, False),
+        ({RANGE: "LOCALHOST"}, {RANGE: "LOCALHOST"}, False),
+        ({RANGE: "SUBNET"}, {RANGE: "SUBNET"}, True),
+        ({RANGE: "SYSTEM_DEFAULT"}, {RANGE: "SYSTEM_DEFAULT"}, True),
+        ({PROFILES: "mine.xml"}, {PROFILES: "mine.xml", RANGE: "LOCALHOST"}, True),
+        ({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, {RANGE: "LOCALHOST"}, False),
     ],
 )
-def test_nodes_stay_on_this_host_and_what_the_environment_says_is_left_alone(monkeypatch, given, expected):
+def test_nodes_stay_on_this_host_and_what_the_environment_says_is_left_alone(monkeypatch, given, expected, further):
     environment = dict(given)
     monkeypatch.setattr(discovery.os, "environ", environment)
+    before = discovery.reaches_further()
     discovery.confine_discovery()
     assert environment == given | expected
+    assert (before, discovery.reaches_further()) == (further, further)
 
 
 def test_a_node_listens_on_the_loopback_interface_alone_and_keeps_nothing_in_shared_memory():
