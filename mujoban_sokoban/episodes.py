@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -73,16 +74,25 @@ class LevelSource:
 
 
 class LazyEpisodes(Sequence[EpisodeSpec]):
-    """Numbered episodes, each made when it is first asked for."""
+    """Numbered episodes, each made when it is asked for, and kept while somebody plays it."""
 
     def __init__(self, count: int) -> None:
         """Number `count` episodes from 0."""
         self._count = count
-        self._made: dict[int, EpisodeSpec] = {}
+        # Episodes that are over go: kept among what a world allocates and frees, they would hold all of it.
+        self._made: WeakValueDictionary[int, EpisodeSpec] = WeakValueDictionary()
 
     @abstractmethod
     def _make(self, index: int) -> EpisodeSpec:
-        """Return episode `index`; called once for each."""
+        """Return episode `index`, the same whenever it is made."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but what was made."""
+        return {name: value for name, value in vars(self).items() if name != "_made"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over what `__getstate__` returned."""
+        vars(self).update(state, _made=WeakValueDictionary())
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -98,9 +108,10 @@ class LazyEpisodes(Sequence[EpisodeSpec]):
             return [self[i] for i in range(*index.indices(len(self)))]
         if not 0 <= index < len(self):
             raise IndexError(f"episode {index} of {len(self)}")
-        if index not in self._made:
-            self._made[index] = self._make(index)
-        return self._made[index]
+        made = self._made.get(index)
+        if made is None:
+            made = self._made[index] = self._make(index)
+        return made
 
 
 class Episodes(LazyEpisodes):
