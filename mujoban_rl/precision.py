@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from typing import Final
 
 import torch
+
+# oneDNN's kernels for AVX2 crash, or change from call to call, in gradients of the controller's convolutions; those for
+# SSE4.1 take as long there. It reads the variable with its first kernel.
+if torch.backends.cpu.get_cpu_capability() == "AVX2":
+    os.environ.setdefault("DNNL_MAX_CPU_ISA", "SSE41")
 
 _BFLOAT16: Final = ("amx_bf16", "avx512_bf16", "bf16")
 """Instructions for bfloat16 as `torch.cpu.get_capabilities` names them, of x86 and of ARM."""
