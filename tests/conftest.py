@@ -12,6 +12,7 @@ os.environ.setdefault("LP_NUM_THREADS", "0")
 
 import pytest
 
+import mujoban_rl.precision  # noqa: F401  # chooses kernels of oneDNN, before any test computes
 from mujoban_msgs_py.runtime.discovery import PROFILES, RANGE, confine_discovery
 
 # Before ROS is initialised, here or in a child process.
