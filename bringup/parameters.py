@@ -47,8 +47,8 @@ def graph_parameters(stack: Player, episodes: Episodes, *, run: int = 0, **simul
         **simulator: Further parameters of the simulator.
     """
     parameters = read_parameters()
-    parameters["simulator"]["run"] = run
     parameters["simulator"] |= {
+        "run": run,
         "body": stack.body,
         "seed": episodes.seed,
         "episodes": len(episodes),
