@@ -53,7 +53,7 @@ class Options:
 
 
 def slope(hours: NDArray[np.float64], values: NDArray[np.float64], blocks: int) -> dict[str, Any]:
-    """Return the slope per hour of a line through the means of blocks, its interval of 95 %, and first and last mean.
+    """Return the slope per hour of a line through the means of blocks, its interval of 95 %, and those means.
 
     Raises:
         ValueError: If there are fewer than 3 values.
@@ -69,8 +69,7 @@ def slope(hours: NDArray[np.float64], values: NDArray[np.float64], blocks: int) 
     return {
         "per_hour": round(float(line), 4),
         "interval": [round(float(line - margin), 4), round(float(line + margin), 4)],
-        "first": round(float(y[0]), 3),
-        "last": round(float(y[-1]), 3),
+        "blocks": [round(float(mean), 3) for mean in y],
     }
 
 

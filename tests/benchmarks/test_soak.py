@@ -15,7 +15,7 @@ def test_a_leak_is_seen_through_noise_and_a_flat_run_is_flat() -> None:
     flat, leak = slope(hours, 500.0 + noise, 24), slope(hours, 500.0 + 4.0 * hours + noise, 24)
     assert flat["interval"][0] < 0.0 < flat["interval"][1]
     assert 0.0 < leak["interval"][0] < 4.0 < leak["interval"][1]
-    assert leak["last"] - leak["first"] == pytest.approx(8.0, abs=1.0)
+    assert leak["blocks"][-1] - leak["blocks"][0] == pytest.approx(8.0, abs=1.0)
 
 
 def test_the_start_counts_for_nothing_and_too_short_a_run_is_refused() -> None:
