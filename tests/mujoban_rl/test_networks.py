@@ -1,11 +1,13 @@
-"""Distributions over torques that the world limits, and the precision in which frames are encoded."""
+"""Distributions over torques that the world limits, and how networks are computed in training."""
 
 import math
+import os
 
 import pytest
 import torch
 
 from mujoban_rl.networks import Gaussian, encode_frames
+from mujoban_rl.precision import limit_kernels
 
 
 def test_torques_beyond_a_limit_have_the_probability_of_the_tail():
@@ -42,3 +44,15 @@ def test_frames_are_encoded_in_bfloat16_only_where_the_processor_has_instruction
     frame = torch.zeros(1, 8, 8, 3, dtype=torch.uint8)
     features = encode_frames(encoder, frame, torch.float32, mixed_precision=True)
     assert computed == [precision] and features.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("capability", "own", "limit"), [("AVX2", "", "SSE41"), ("AVX2", "AVX", "AVX"), ("AVX512", "", "")]
+)
+def test_gradients_keep_off_the_kernels_for_avx2_alone(monkeypatch, capability, own, limit):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    monkeypatch.delenv("DNNL_MAX_CPU_ISA", raising=False)
+    if own:
+        monkeypatch.setenv("DNNL_MAX_CPU_ISA", own)
+    limit_kernels()
+    assert os.environ.pop("DNNL_MAX_CPU_ISA", "") == limit
