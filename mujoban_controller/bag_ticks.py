@@ -109,6 +109,7 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
         "truncated": (discount == 0.0) & ~failed,
         "goal": goal_offsets(view)[:-1],
         "kind": goals.kind[:-1].copy(),
+        "heading": view.pose[:-1, 2].copy(),
     }
 
 

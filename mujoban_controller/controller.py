@@ -5,7 +5,8 @@ the mean and scale of a normal distribution over torques.
 
 Proprioception holds joint positions, so the network is given sine and cosine of each hinge, as they are and
 turned into the frame of the instruction (instructed direction = +x). For the ball, whose steer joint is the
-heading, this says at once by how much to turn.
+heading, this says at once by how much to turn. A body that does not feel its heading is given what its gyro and the
+skyline say of it instead, and feels and acts as the side sees it that it puts ahead (`orientation`).
 
 It is also given dead reckoning: how far the robot has come since the instruction began, which is the sum of the
 velocities that it feels. The sum is part of the memory, beside the LSTM's; A, o_pr and beta are all it takes.
@@ -25,6 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_controller.drivers import ControllerDriver, Driver
+from mujoban_controller.orientation import NEEDLE, Compass, Sides, heading_of
 from mujoban_controller.policy import GoalPolicy
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
@@ -38,6 +40,9 @@ MEMORY_FIELDS = ("memory0", "memory1", "memory2")
 """Its memory before a tick, `Recurrent`."""
 _CLIP = 5.0
 _TRACK = 7
+_SIDE = _TRACK + NEEDLE
+_AWAY = 0.5
+"""Cosine of the angle between the side ahead and the instruction from which on another side is put ahead."""
 
 
 class Recurrent(NamedTuple):
@@ -48,7 +53,7 @@ class Recurrent(NamedTuple):
     cell: Tensor
     """LSTM cell, [B, H]."""
     track: Tensor
-    """Dead reckoning, [B, 7]; see `dead_reckoning`."""
+    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading needle (2) and side ahead (1) follow."""
 
 
 def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
@@ -65,12 +70,12 @@ def dead_reckoning(track: Tensor, velocity: Tensor, heading: Tensor, terminated:
     Args:
         track: Before the tick, [B, 7]; zeros at an episode's start.
         velocity: In the robot's frame in cells per second, [B, 2].
-        heading: Angle of the robot in radians, [B].
+        heading: Unit vector in which the robot faces, [B, 2].
         terminated: Whether a new instruction begins with this tick, [B].
         period: Seconds of a tick.
     """
     moved, before, last, known = track[:, :2], track[:, 2:4], track[:, 4:6], track[:, 6:]
-    cos, sin = heading.cos(), heading.sin()
+    cos, sin = heading.unbind(-1)
     now = torch.stack(
         [velocity[:, 0] * cos - velocity[:, 1] * sin, velocity[:, 0] * sin + velocity[:, 1] * cos], -1
     )
@@ -89,6 +94,8 @@ class ControllerOutput(NamedTuple):
     """Distribution over torques; mean and scale [B, T, U]."""
     features: Tensor
     """What the action rests on, [B, T, H + F]; auxiliary losses attach here."""
+    heading: Tensor | None
+    """Unit vectors in which the robots face as far as is seen, [B, T, 2]; None for a body that feels it."""
     memory: Recurrent
     """Memory after the last tick."""
 
@@ -133,14 +140,18 @@ class VisuomotorController(GoalPolicy, Controller):
         """Whether the ResNet may compute in bfloat16: in training, not on the robot, so that runs repeat exactly."""
         self.joints = len(layout.joints)
         self.proprio_size, self.action_size, self.hidden = layout.proprio_size, layout.action_size, hidden
-        # Joint positions are replaced by two sine-cosine pairs; A is one-hot, beta one bit.
-        inputs = self.proprio_size + 3 * self.joints + len(Instruction) + 1 + _TRACK - 1
-        # A root of slides has a hinge for its heading; a free one has to do with its turns since the start.
         self.heading_index = layout.heading_index
         self.part = layout.proprio
         self.cell_size = layout.cell_size
+        self.sides = Sides(layout)
+        self.compass = Compass(layout, features) if self.heading_index is None else None
+        # Where the heading is felt, joint positions are replaced by two sine-cosine pairs; else it is told, and the
+        # side ahead, one-hot as A is. Beta is one bit.
+        angles = 3 * self.joints if self.compass is None else NEEDLE + self.sides.count
+        inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1
         shrink = 2 ** (len(channels) - 1)
-        self.first_row = rows_of_sky(layout.camera, shrink)
+        # Who does not feel the heading has to look at the skyline.
+        self.first_row = rows_of_sky(layout.camera, shrink) if self.compass is None else 0
         self.encoder = frame_encoder(channels, features, FRAME_SIZE - self.first_row)
         self.body_encoder = nn.Sequential(nn.Linear(inputs, features), nn.LayerNorm(features), nn.ReLU())
         self.mix = nn.Sequential(nn.Linear(2 * features, features), nn.ReLU())
@@ -158,7 +169,12 @@ class VisuomotorController(GoalPolicy, Controller):
         return not bool((self.proprio_scale == 1.0).all())
 
     def fit_normalisation(self, proprio: Tensor) -> None:
-        """Take mean and deviation of proprioceptive samples, [M, P], for the normalisation of inputs."""
+        """Take mean and deviation of proprioceptive samples, [M, P], for the normalisation of inputs.
+
+        Each is taken as any side would see it that may be ahead.
+        """
+        sides = torch.arange(self.sides.count, device=proprio.device).repeat_interleave(len(proprio))
+        proprio = self.sides.felt(proprio.repeat(self.sides.count, 1), sides)
         self.proprio_mean.copy_(proprio.mean(0))
         self.proprio_scale.copy_(proprio.std(0).clamp(min=1e-2))
 
@@ -172,12 +188,37 @@ class VisuomotorController(GoalPolicy, Controller):
         seen, dtype = frame[:, self.first_row :], self.mean.weight.dtype
         return encode_frames(self.encoder, seen, dtype, mixed_precision=self.mixed_precision)
 
-    def reckon(self, proprio: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
-        """Return the track after one more tick, [B, 7], from o_pr [B, P], beta [B] and the track before, [B, 7]."""
-        at = self.heading_index
-        heading = torch.zeros_like(proprio[:, 0]) if at is None else proprio[:, at]
+    def reckon(
+        self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor, seen: Tensor
+    ) -> Tensor:
+        """Return the track after one more tick, [B, 7 or 10].
+
+        Args:
+            proprio: o_pr, [B, P].
+            instruction: A, int64 [B].
+            terminated: beta, bool [B].
+            track: Before the tick; zeros at an episode's start.
+            seen: Features of the frame, [B, F].
+        """
         velocity = proprio[:, self.part.planar_velocity] / self.cell_size
-        return dead_reckoning(track, velocity, heading, terminated, CONTROL_PERIOD)
+        before = track[:, :_TRACK]
+        if self.compass is None:
+            angle = proprio[:, self.heading_index]
+            heading = torch.stack([angle.cos(), angle.sin()], -1)
+            return dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
+        needle = self.compass(seen, proprio, track[:, _TRACK:_SIDE])
+        heading, side = heading_of(needle), track[:, _SIDE].long()
+        # Chosen for each instruction; and anew where the robot turned, or was mistaken about its heading.
+        away = self.sides.relative(heading, instruction, side)[:, 0] < _AWAY
+        new = terminated | (before[:, -1] == 0) | away
+        side = torch.where(new, self.sides.ahead(heading, instruction), side)
+        place = dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
+        return torch.cat([place, needle, side[:, None].to(place.dtype)], -1)
+
+    def side_ahead(self, memory: Memory) -> Tensor:
+        """Return the side that each robot puts ahead, in quarter turns to the left, int64 [B]."""
+        track = Recurrent(*memory).track
+        return torch.zeros(len(track), dtype=torch.int64) if self.compass is None else track[:, _SIDE].long()
 
     def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
         """Return the encoding of all inputs but the frame, [M, F].
@@ -186,19 +227,27 @@ class VisuomotorController(GoalPolicy, Controller):
             proprio: o_pr, [M, P].
             instruction: A, int64 [M].
             terminated: beta, bool [M].
-            track: Dead reckoning, [M, 7].
+            track: Dead reckoning and what goes with it, [M, 7 or 10].
         """
         part = self.part
-        angle = proprio[:, part.joint_position]
-        normal = ((proprio - self.proprio_mean) / self.proprio_scale).clamp(-_CLIP, _CLIP)
-        rest = torch.cat([normal[:, part.inertial], normal[:, part.joint_velocity], normal[:, part.up_axis]], -1)
         # Shape [M, 1] each.
         axis = tuple(x[:, None] for x in self.axes[instruction].unbind(-1))
-        parts = [rest, angle.cos(), angle.sin(), *turn_to_instruction(angle.cos(), angle.sin(), *axis)]
+        if self.compass is None:
+            angle = proprio[:, part.joint_position]
+            normal = self._normal(proprio)
+            parts = [normal[:, part.inertial], normal[:, part.joint_velocity], normal[:, part.up_axis]]
+            parts += [angle.cos(), angle.sin(), *turn_to_instruction(angle.cos(), angle.sin(), *axis)]
+        else:
+            side = track[:, _SIDE].long()
+            towards = self.sides.relative(heading_of(track[:, _TRACK:_SIDE]), instruction, side)
+            parts = [self._normal(self.sides.felt(proprio, side)), towards, functional.one_hot(side, self.sides.count)]
         # Positions are clipped like the rest: a robot that is stuck for long must not drown everything else.
         parts += turn_to_instruction(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), *axis)
         parts += [functional.one_hot(instruction, len(Instruction)), terminated[:, None]]
         return self.body_encoder(torch.cat([p.to(proprio.dtype) for p in parts], -1))
+
+    def _normal(self, proprio: Tensor) -> Tensor:
+        return ((proprio - self.proprio_mean) / self.proprio_scale).clamp(-_CLIP, _CLIP)
 
     def forward(
         self,
@@ -222,11 +271,12 @@ class VisuomotorController(GoalPolicy, Controller):
         b, t = instruction.shape
         keep = torch.ones_like(proprio[..., :1]) if first is None else (~first[..., None]).to(proprio.dtype)
         h, c, track = memory
-        tracks = []
-        for i in range(t):
-            track = self.reckon(proprio[:, i], terminated[:, i], track * keep[:, i])
-            tracks.append(track)
         seen = self.encode(frame.flatten(0, 1))
+        shown, tracks = seen.view(b, t, -1), list[Tensor]()
+        for i in range(t):
+            past = track * keep[:, i]
+            track = self.reckon(proprio[:, i], instruction[:, i], terminated[:, i], past, shown[:, i])
+            tracks.append(track)
         tracked = torch.stack(tracks, 1).flatten(0, 1)
         felt = self.embed(proprio.flatten(0, 1), instruction.flatten(), terminated.flatten(), tracked)
         # Shape [B, T, F].
@@ -236,7 +286,9 @@ class VisuomotorController(GoalPolicy, Controller):
             h, c = self.lstm(mixed[:, i], (h * keep[:, i], c * keep[:, i]))
             outputs.append(h)
         features = torch.cat([torch.stack(outputs, 1), mixed], -1)
-        return ControllerOutput(self.distribution(features), features, Recurrent(h, c, track))
+        tracked = tracked.view(b, t, -1)
+        heading = None if self.compass is None else heading_of(tracked[..., _TRACK:_SIDE])
+        return ControllerOutput(self.distribution(features, tracked), features, heading, Recurrent(h, c, track))
 
     def over_windows(self, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
         """Return the distributions in the ticks of windows [M, W, ...] from number `skipped` on, [M, W - n, U].
@@ -250,15 +302,20 @@ class VisuomotorController(GoalPolicy, Controller):
         """Return a driver by the mean torques, with a memory of its own."""
         return ControllerDriver(self)
 
-    def distribution(self, features: Tensor) -> Gaussian:
-        """Return the distribution over torques given `ControllerOutput.features`."""
+    def distribution(self, features: Tensor, track: Tensor) -> Gaussian:
+        """Return the distribution over torques given `ControllerOutput.features` and the tracks, [B, T, ...]."""
         x = self.trunk(features)
-        return gaussian(self.mean(x), self.scale(x))
+        own = gaussian(self.mean(x), self.scale(x))
+        if self.compass is None:
+            return own
+        side = track[..., _SIDE].long()
+        return Gaussian(self.sides.torques(own.mean, side), self.sides.torques(own.scale, side))
 
     def initial_memory(self, batch: int) -> Memory:
         """Return zeros, a `Recurrent`."""
         device = self.mean.weight.device
-        return Recurrent(*(torch.zeros(batch, n, device=device) for n in (self.hidden, self.hidden, _TRACK)))
+        track = _TRACK if self.compass is None else _SIDE + 1
+        return Recurrent(*(torch.zeros(batch, n, device=device) for n in (self.hidden, self.hidden, track)))
 
     @torch.inference_mode()
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:

@@ -67,6 +67,8 @@ class DistilConfig:
     clip: float = 5.0
     goal_weight: float = 0.5
     kind_weight: float = 0.05
+    heading_weight: float = 1.0
+    """Weight of the heading that is read from the skyline, for a body that does not feel its own."""
     infeasible_weight: float = 1.0
     """Weight of the torques under an instruction towards a wall or a blocked box. Below 1, a student in doubt whether
     a push is possible tries it: the loss is nearly absolute, so it acts from this share of the odds on."""
@@ -107,7 +109,13 @@ def imitation_loss(
     goal = functional.smooth_l1_loss(offsets, batch["goal"], beta=0.1)
     kind = functional.cross_entropy(logits.flatten(0, 1), batch["kind"].flatten())
     loss = action + 0.01 * spread + config.goal_weight * goal + config.kind_weight * kind
-    stats = {
+    stats = {}
+    if output.heading is not None:
+        truth = torch.stack([batch["heading"].cos(), batch["heading"].sin()], -1)
+        turned = 1.0 - (output.heading * truth).sum(-1)
+        loss = loss + config.heading_weight * turned.mean()
+        stats["error/heading_degrees"] = turned.clamp(0.0, 2.0).neg().add(1.0).acos().rad2deg().median()
+    stats |= {
         "loss/action": action,
         "loss/goal": goal,
         "loss/kind": kind,
@@ -140,6 +148,7 @@ class DistilPlayer(CameraPlayer):
 
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
         config, task, generator = self._config, self.task, self.generator
+        task.put_ahead(self.policy.side_ahead(self._memory).numpy())
         label = self._teacher(task)
         if self._frames % (config.window * len(mean)) == 0:
             share = max(1.0 - self._frames / max(config.warm_up, 1), config.guided)
@@ -153,6 +162,7 @@ class DistilPlayer(CameraPlayer):
         torque = torch.where(self._driven[:, None], torch.from_numpy(label) + self._wandering, own)
         goals = task.world.goals
         extra = {"label": label, "goal": goal_offsets(task.world), "kind": goals.kind.copy()}
+        extra["heading"] = task.world.pose[:, 2].copy()
         return torque.clamp(-1.0, 1.0).numpy(), extra
 
     def state(self) -> State:

@@ -33,8 +33,8 @@ BOX_FRICTION = 0.5
 """Sliding friction of a box on the floor, in every world; how far a box coasts follows from it."""
 
 
-class Mirror(NamedTuple):
-    """Entry i of a mirrored vector is `sign[i]` times entry `source[i]`."""
+class Rearrangement(NamedTuple):
+    """Entry i of a vector as it is seen is `sign[i]` times entry `source[i]`."""
 
     source: NDArray[np.int64]
     sign: NDArray[np.float32]
@@ -45,12 +45,12 @@ class FeatureLayout(NamedTuple):
 
     size: int
     """D."""
-    mirror: Mirror
+    mirror: Rearrangement
     """Of the features, [D]."""
-    mirror_action: Mirror
+    mirror_action: Rearrangement
     """Of the actions, [U]."""
-    joints: NDArray[np.int64]
-    """Order of joints as each side sees them, [S, J]."""
+    proprio: Rearrangement
+    """Proprioception as each side sees it, [S, P]."""
     actuators: NDArray[np.int64]
     """Order of actuators as each side sees them, [S, U]."""
 
@@ -65,7 +65,7 @@ def feature_layout(body: Body) -> FeatureLayout:
     """Return the layout for a body."""
     source, sign = (np.array(v) for v in body.symmetry.mirror)
     posture = np.flatnonzero([r is not None for r in body.joint_range])
-    sides = np.array(body.sides, np.int64)
+    views = [np.array(column) for column in zip(*body.proprio_sides, strict=True)]
     actuators = np.array([body.of_actuators(order) for order in body.sides], np.int64)
     acting = np.array(body.of_actuators(body.symmetry.mirror.source), np.int64)
     acting_sign = sign[[body.joints.index(a.joint) for a in body.actuators]]
@@ -82,8 +82,9 @@ def feature_layout(body: Body) -> FeatureLayout:
     for block, _ in blocks:
         sources.append(start + block)
         start += len(block)
-    mirror = Mirror(np.concatenate(sources), np.concatenate([s for _, s in blocks]).astype(np.float32))
-    return FeatureLayout(start, mirror, Mirror(acting, acting_sign.astype(np.float32)), sides, actuators)
+    mirror = Rearrangement(np.concatenate(sources), np.concatenate([s for _, s in blocks]).astype(np.float32))
+    seen = Rearrangement(views[0], views[1].astype(np.float32))
+    return FeatureLayout(start, mirror, Rearrangement(acting, acting_sign.astype(np.float32)), seen, actuators)
 
 
 def wrap(angle: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -110,18 +111,15 @@ def goal_offsets(world: GoalView) -> NDArray[np.float32]:
 
 
 def side_ahead(world: GoalView) -> NDArray[np.int64]:
-    """Return which side of each robot looks best at its goal, in quarter turns to the left, [B].
+    """Return which side of each robot looks best along its instruction, in quarter turns to the left, [B].
 
-    That is the instruction's direction for a push. Otherwise it is where the target lies, which may be behind after
-    an overshoot.
+    With STAY it is the front. To look at the target instead, which an overshoot leaves behind, changes nothing: of
+    1,890 instructions of 64 levels the ant's teacher completes 1,865 one way and 1,866 the other.
     """
     if world.body.symmetry.sides == 1:
         return np.zeros(world.batch, np.int64)
-    goals = world.goals
-    offset = goals.robot_target - world.pose[:, :2]
-    course = np.where((goals.kind == GoalKind.PUSH)[:, None], OFFSETS_XY[goals.direction], offset)
-    there = (goals.kind != GoalKind.PUSH) & (np.hypot(*offset.T) < 0.05 * world.body.cell_size)
-    angle = np.where(there, world.pose[:, 2], np.arctan2(course[:, 1], course[:, 0]))
+    course = OFFSETS_XY[world.goals.direction]
+    angle = np.where(course.any(1), np.arctan2(course[:, 1], course[:, 0]), world.pose[:, 2])
     return np.rint(wrap(angle - world.pose[:, 2]) / (np.pi / 2)).astype(np.int64) % 4
 
 
@@ -150,14 +148,7 @@ def privileged_features(
     heading = world.pose[:, 2] + quarter
     ahead = np.stack([np.cos(heading), np.sin(heading)], 1)
     lane = INSTRUCTION_AXES[goals.direction]
-    # Vectors of proprioception are in the frame of the robot's own front.
-    own = np.stack([np.cos(quarter), np.sin(quarter)], 1)
-
-    def felt(part: slice) -> NDArray[np.floating]:
-        v = world.proprio[:, part]
-        return np.concatenate([_turn(v[:, :2], own), v[:, 2:]], 1)
-
-    order = layout.joints[side]
+    felt = layout.proprio.sign[side] * np.take_along_axis(world.proprio, layout.proprio.source[side], 1)
     push = (goals.kind == GoalKind.PUSH)[:, None]
     box = world.box_position[rows, goals.box_index].astype(np.float64)
     to_target = (goals.robot_target - world.pose[:, :2]) / size
@@ -166,12 +157,12 @@ def privileged_features(
     rest_left = np.where(push, (goals.box_target - rest_position(world)) / size, 0.0)
     vectors = [to_target, to_box, box_left, rest_left]
     parts = [
-        _posture(world, order),
-        np.take_along_axis(world.proprio[:, at.joint_velocity], order, 1),
+        _posture(body, felt),
+        felt[:, at.joint_velocity],
         np.take_along_axis(torque, layout.actuators[side], 1),
-        felt(at.linear_velocity) / size,
-        felt(at.angular_velocity),
-        felt(at.up_axis),
+        felt[:, at.linear_velocity] / size,
+        felt[:, at.angular_velocity],
+        felt[:, at.up_axis],
         _relative_heading(world, heading, lane),
         *(_turn(v, ahead) for v in vectors),
         *(_turn(v, lane) for v in vectors[:3]),
@@ -184,13 +175,11 @@ def privileged_features(
     return np.concatenate(parts, 1).astype(np.float32)
 
 
-def _posture(world: GoalView, order: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the positions of joints that have a range, from -1 to 1 within it."""
-    ranges = world.body.joint_range
-    kept = [j for j, limits in enumerate(ranges) if limits is not None]
-    low, high = np.array([limits or (-1.0, 1.0) for limits in ranges]).T
-    share = (2.0 * world.proprio[:, world.body.proprio.joint_position] - low - high) / (high - low)
-    return np.take_along_axis(share, order, 1)[:, kept]
+def _posture(body: Body, felt: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the positions of joints that have a range, from -1 to 1 within it, as the side ahead sees them."""
+    kept = [j for j, limits in enumerate(body.joint_range) if limits is not None]
+    low, high = np.array([limits for limits in body.joint_range if limits is not None]).reshape(-1, 2).T
+    return (2.0 * felt[:, body.proprio.joint_position][:, kept] - low - high) / (high - low)
 
 
 def _relative_heading(

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import feature_layout, goal_offsets, privileged_features, side_ahead
+from mujoban_controller.goal_features import feature_layout, goal_offsets, privileged_features, side_ahead, wrap
 from mujoban_controller.goal_rewards import GoalReward, fallen
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.instructions import TerminationNoise, feasible_kinds, random_instruction
@@ -258,6 +258,13 @@ class GoalTask:
         resting = world.box_speed[np.arange(world.batch), goals.box_index] < 0.05 * world.body.cell_size
         stuck = (left[:, 0] < -0.02) & (np.hypot(*left.T) > self.config.tolerance) & resting
         return (goals.kind == GoalKind.PUSH) & ((left[:, 0] < -self.config.overshoot) | stuck) & ~completed
+
+    def put_ahead(self, side: NDArray[np.int64]) -> None:
+        """Put the sides ahead, [B], that a policy chooses, where they are less than 60 degrees off the instruction."""
+        course = OFFSETS_XY[self.instruction]
+        off = wrap(np.arctan2(course[:, 1], course[:, 0]) - self.world.pose[:, 2] - side * (np.pi / 2))
+        facing = (self.instruction != int(Instruction.STAY)) & (np.abs(off) < np.pi / 3)
+        self.side = np.where(facing, side, self.side)
 
     def _turn_sides(self, issued: NDArray[np.int64]) -> None:
         """Choose the side ahead where an instruction is new, or has lasted for long and is no push."""

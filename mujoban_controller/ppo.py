@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
-from mujoban_controller.goal_features import Mirror, feature_layout
+from mujoban_controller.goal_features import Rearrangement, feature_layout
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.judge import OutcomeSummary
 from mujoban_controller.privileged import PrivilegedPolicy, Value
@@ -80,7 +80,7 @@ def log_prob(policy: Gaussian, action: Tensor) -> Tensor:
     return Independent(Normal(policy.mean, policy.scale, validate_args=False), 1, validate_args=False).log_prob(action)
 
 
-def mirrored(x: Tensor, mirror: Mirror) -> Tensor:
+def mirrored(x: Tensor, mirror: Rearrangement) -> Tensor:
     """Return what the mirrored robot would see or do, [..., N]."""
     return x[..., torch.from_numpy(mirror.source)] * torch.from_numpy(mirror.sign)
 

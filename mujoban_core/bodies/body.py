@@ -232,6 +232,21 @@ class Body:
             orders.append(tuple(turn[i] for i in orders[-1]))
         return tuple(orders)
 
+    @property
+    def proprio_sides(self) -> tuple[Relabelling, ...]:
+        """How proprioception looks with each side ahead, in quarter turns to the left, [S] relabellings of P values."""
+        part, views = self.proprio, []
+        for side, joints in enumerate(self.sides):
+            source, sign = list(range(part.size)), [1.0] * part.size
+            for vector in (part.linear_velocity, part.angular_velocity, part.linear_acceleration, part.up_axis):
+                x, y = vector.start, vector.start + 1
+                source[x], source[y] = (x, y) if side % 2 == 0 else (y, x)
+                sign[x], sign[y] = ((1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0))[side]
+            for angles in (part.joint_position, part.joint_velocity):
+                source[angles] = [angles.start + joint for joint in joints]
+            views.append(Relabelling(tuple(source), tuple(sign)))
+        return tuple(views)
+
     def of_actuators(self, source: tuple[int, ...]) -> tuple[int, ...]:
         """Return the order of actuators that goes with an order of joints."""
         joints = [self.joints.index(a.joint) for a in self.actuators]

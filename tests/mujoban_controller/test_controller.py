@@ -125,7 +125,7 @@ def test_every_instruction_looks_the_same_to_a_robot_that_faces_along_it(control
 def test_dead_reckoning_follows_a_drive_round_a_corner():
     # Two seconds east at 1 m/s, then on the spot to the north, then one second north; velocities in the robot's frame.
     velocity = torch.tensor([[1.0, 0.0]] * 41 + [[0.0, 0.0]] + [[1.0, 0.0]] * 21)
-    heading = torch.tensor([0.0] * 42 + [np.pi / 2] * 21)
+    heading = torch.tensor([[1.0, 0.0]] * 42 + [[0.0, 1.0]] * 21)
     track = torch.zeros(1, 7)
     for t in range(len(velocity)):
         beta = torch.tensor([t == 41])

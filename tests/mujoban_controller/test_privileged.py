@@ -58,11 +58,16 @@ def test_mirroring_twice_and_turning_four_times_change_nothing(body):
     for mirror in (layout.mirror, layout.mirror_action):
         assert np.array_equal(mirror.source[mirror.source], np.arange(len(mirror.source)))
         assert (mirror.sign * mirror.sign[mirror.source] == 1.0).all()
-    assert len(layout.joints) == body.symmetry.sides
-    order = np.arange(len(body.joints))
-    for _ in range(4):
-        order = order[layout.joints[-1]] if body.symmetry.sides > 1 else order
-    assert np.array_equal(order, np.arange(len(body.joints)))
+    assert len(layout.proprio.source) == body.symmetry.sides
+    proprio = felt = np.random.default_rng(0).normal(size=body.proprio_size)
+    for side in range(body.symmetry.sides):
+        at_once = layout.proprio.sign[side] * proprio[layout.proprio.source[side]]
+        np.testing.assert_array_equal(felt, at_once)
+        felt = layout.proprio.sign[-1] * felt[layout.proprio.source[-1]]
+        # The last side is a quarter turn to the right: three of them are one to the left.
+        for _ in range(2 if body.symmetry.sides > 1 else 0):
+            felt = layout.proprio.sign[-1] * felt[layout.proprio.source[-1]]
+    np.testing.assert_array_equal(felt, proprio)
 
 
 def test_an_ant_that_is_turned_by_a_quarter_puts_another_side_ahead_and_sees_the_same():
