@@ -128,11 +128,9 @@ class VisuomotorController(GoalPolicy, Controller):
             hidden: H, width of the LSTM.
 
         Raises:
-            ValueError: If the body is unknown or there are fewer than two widths.
+            ValueError: If the body is unknown, or the widths are not what `frame_encoder` takes.
         """
         super().__init__()
-        if len(channels) < 2:
-            raise ValueError(f"channels {tuple(channels)}: expected the stem's width and one for each residual block")
         layout = get_body(body)
         self.config = {"body": body, "channels": list(channels), "features": features, "hidden": hidden}
         self.body = body

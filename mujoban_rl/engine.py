@@ -29,7 +29,6 @@ from mujoban_core.program import say
 from mujoban_core.signals import StopSignal
 from mujoban_core.text import readable
 from mujoban_rl.limits import NaNGuard, TimeLimit
-from mujoban_rl.precision import limit_kernels
 from mujoban_rl.progress import Budget, Clock, Meter, Progress
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.training_log import TrainingLog
@@ -177,7 +176,6 @@ class Trainer(Generic[BatchT]):
         Raises:
             RunError: If there are checkpoints but none is intact, or they are of another kind of run.
         """
-        limit_kernels()
         self.directory, self.learner, self.source = directory, learner, source
         self.budget, self.cadence = budget, cadence or Cadence()
         self.progress = Progress()

@@ -22,6 +22,8 @@ MIN_SCALE: Final = 1e-3
 INITIAL_SCALE: Final = 0.5
 """Standard deviation of every torque before training."""
 _CLIP: Final = 5.0
+_NARROWEST: Final = 8
+"""Channels of an encoder at least."""
 
 
 class Gaussian(NamedTuple):
@@ -138,7 +140,17 @@ class ResidualBlock(nn.Module):
 
 
 def frame_encoder(channels: Sequence[int], features: int, rows: int) -> nn.Sequential:
-    """Return the ResNet from frames [B, 3, rows, 64] to features [B, F]; the last block keeps its resolution."""
+    """Return the ResNet from frames [B, 3, rows, 64] to features [B, F]; the last block keeps its resolution.
+
+    Raises:
+        ValueError: If there are fewer than two widths, or one is below 8: in the gradient of a strided 1x1 convolution
+            of fewer channels, oneDNN writes beyond its memory on processors with AVX2 but not AVX-512 (PyTorch 2.13).
+    """
+    if len(channels) < 2 or min(channels) < _NARROWEST:
+        raise ValueError(
+            f"channels {' '.join(map(str, channels))}: expected the stem's width and one for each residual block, "
+            f"each at least {_NARROWEST}"
+        )
     stem, *widths = channels
     layers: list[nn.Module] = [nn.Conv2d(3, stem, 4, 2, 1), nn.ReLU()]
     shrink, width = 2, stem

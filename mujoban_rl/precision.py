@@ -1,25 +1,13 @@
-"""How networks compute in training: in bfloat16 where the processor has instructions for it, and by sound kernels."""
+"""When networks compute in bfloat16: in training, where the processor has instructions for it."""
 
 from __future__ import annotations
 
-import os
 from typing import Final
 
 import torch
 
 _BFLOAT16: Final = ("amx_bf16", "avx512_bf16", "bf16")
 """Instructions for bfloat16 as `torch.cpu.get_capabilities` names them, of x86 and of ARM."""
-
-
-def limit_kernels() -> None:
-    """Keep oneDNN from its kernels for AVX2 on processors without AVX-512, unless the environment says otherwise.
-
-    They crash, or change from call to call, in gradients of the controller's convolutions. Those for AVX take 1.4 times
-    as long there, those for SSE4.1 2.6 times. oneDNN reads the variable with its first kernel. Who does not train keeps
-    the kernels for AVX2, so that all nodes of a graph round alike.
-    """
-    if torch.backends.cpu.get_cpu_capability() == "AVX2":
-        os.environ.setdefault("DNNL_MAX_CPU_ISA", "AVX")
 
 
 def bfloat16_pays(device: torch.device | str) -> bool:

@@ -13,13 +13,11 @@ os.environ.setdefault("LP_NUM_THREADS", "0")
 import pytest
 
 from mujoban_msgs_py.runtime.discovery import PROFILES, RANGE, confine_discovery
-from mujoban_rl.precision import limit_kernels
 
 # Before ROS is initialised, here or in a child process.
 for name in (RANGE, PROFILES):
     os.environ.pop(name, None)
 confine_discovery()
-limit_kernels()  # before any test computes
 
 IMPORTABLE = str(Path(__file__).parent / "importable")
 """Where worker processes import from what tests let them do."""

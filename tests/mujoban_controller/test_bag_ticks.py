@@ -105,7 +105,7 @@ def test_the_transitions_are_those_of_the_goal_task(recorded):
 def test_rows_go_on_from_episode_to_episode_and_know_the_policys_memory(recorded):
     path, live = recorded
     torch.manual_seed(0)
-    policy = VisuomotorController(channels=(4, 8, 8), features=16, hidden=8)
+    policy = VisuomotorController(channels=(8, 8, 8), features=16, hidden=8)
     stream = BagTicks([path], CONFIG, policy, 2, np.random.default_rng(0))
     found = [next(stream) for _ in range(LENGTH + 1)]
     assert [t for t, tick in enumerate(found) if tick["first"].all()] == [0, LENGTH - 1]
@@ -118,7 +118,7 @@ def test_rows_go_on_from_episode_to_episode_and_know_the_policys_memory(recorded
         np.testing.assert_allclose(found[50][f"memory{i}"][0], values[0].numpy(), atol=1e-4)
 
 
-NETWORK = NetworkConfig(channels=(4, 8, 8), features=16, hidden=8)
+NETWORK = NetworkConfig(channels=(8, 8, 8), features=16, hidden=8)
 MPO = TrainConfig(
     stage="mpo", steps=64, task=GoalTaskConfig(batch=4, difficulty=2), network=NETWORK,
     asymmetric=AsymmetricConfig(window=8, windows=2, sequence=8, replay=128, first=64, reuse=1.0),

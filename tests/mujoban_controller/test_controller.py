@@ -13,7 +13,7 @@ from mujoban_core.interfaces import ControllerInput
 from mujoban_rl.networks import rows_of_sky
 from mujoban_rl.weights import WeightsError, load_weights, save_weights
 
-SMALL = {"channels": (4, 8, 8), "features": 16, "hidden": 12}
+SMALL = {"channels": (8, 8, 8), "features": 16, "hidden": 12}
 
 
 @pytest.fixture

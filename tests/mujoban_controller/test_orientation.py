@@ -75,8 +75,8 @@ def test_a_side_is_put_ahead_only_where_it_faces_the_instruction() -> None:
 
 
 def test_an_ant_that_stands_otherwise_does_the_same_for_an_instruction_turned_as_it_is() -> None:
-    controller = VisuomotorController("ant", (4, 4), 8, 8).eval()
-    assert controller.compass is not None and VisuomotorController(BALL.name, (4, 4), 8, 8).compass is None
+    controller = VisuomotorController("ant", (8, 8), 8, 8).eval()
+    assert controller.compass is not None and VisuomotorController(BALL.name, (8, 8), 8, 8).compass is None
     frame = np.random.default_rng(0).integers(0, 255, (1, 64, 64, 3)).astype(np.uint8)
     proprio = np.random.default_rng(1).normal(size=(1, ANT.proprio_size)).astype(np.float32)
     torques = []
@@ -99,7 +99,7 @@ def test_an_ant_that_stands_otherwise_does_the_same_for_an_instruction_turned_as
 
 
 def test_the_skyline_counts_in_the_loss_of_distillation_and_teaches_the_compass() -> None:
-    controller, config = VisuomotorController("ant", (4, 4), 8, 8), DistilConfig()
+    controller, config = VisuomotorController("ant", (8, 8), 8, 8), DistilConfig()
     m, w = 3, 4
     output = controller(
         torch.randint(0, 255, (m, w, 64, 64, 3), dtype=torch.uint8), torch.randn(m, w, ANT.proprio_size),

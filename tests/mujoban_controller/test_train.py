@@ -30,7 +30,7 @@ from mujoban_sim.goals import GoalKind
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
 TASK = GoalTaskConfig(batch=4, difficulty=1)
-NETWORK = NetworkConfig(channels=(4, 8, 8), features=16, hidden=8)
+NETWORK = NetworkConfig(channels=(8, 8, 8), features=16, hidden=8)
 MPO: dict[str, Any] = dict(window=6, windows=4, sequence=8, replay=64, first=32, reuse=1.0, target_period=2)
 DISTIL = DistilConfig(window=4, windows=2, sequence=4, replay=64, first=16, reuse=0.5)
 STAGES = {
@@ -132,7 +132,7 @@ def test_what_would_have_come_after_an_episode_that_was_cut_off_teaches_the_crit
 
 def test_imitation_prefers_the_teachers_torque():
     torch.manual_seed(0)
-    controller = VisuomotorController(channels=(4, 8, 8), features=16, hidden=8)
+    controller = VisuomotorController(channels=(8, 8, 8), features=16, hidden=8)
     head = GoalHead(24)
     batch = {
         "frame": torch.zeros(1, 2, 64, 64, 3, dtype=torch.uint8),
@@ -157,7 +157,7 @@ def test_imitation_prefers_the_teachers_torque():
 
 def test_torques_of_blocked_instructions_weigh_as_configured():
     config = replace(DISTIL, infeasible_weight=0.25)
-    controller = VisuomotorController(channels=(4, 8, 8), features=16, hidden=8)
+    controller = VisuomotorController(channels=(8, 8, 8), features=16, hidden=8)
     batch = {"goal": torch.zeros(1, 1, 4), "label": torch.full((1, 1, 2), 0.7)}
     output = controller(
         torch.zeros(1, 1, 64, 64, 3, dtype=torch.uint8), torch.zeros(1, 1, controller.proprio_size),

@@ -1,13 +1,11 @@
-"""Distributions over torques that the world limits, and how networks are computed in training."""
+"""Distributions over torques that the world limits, and the precision and width in which frames are encoded."""
 
 import math
-import os
 
 import pytest
 import torch
 
-from mujoban_rl.networks import Gaussian, encode_frames
-from mujoban_rl.precision import limit_kernels
+from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder
 
 
 def test_torques_beyond_a_limit_have_the_probability_of_the_tail():
@@ -46,13 +44,7 @@ def test_frames_are_encoded_in_bfloat16_only_where_the_processor_has_instruction
     assert computed == [precision] and features.dtype == torch.float32
 
 
-@pytest.mark.parametrize(
-    ("capability", "own", "limit"), [("AVX2", "", "AVX"), ("AVX2", "SSE41", "SSE41"), ("AVX512", "", "")]
-)
-def test_gradients_keep_off_the_kernels_for_avx2_alone(monkeypatch, capability, own, limit):
-    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
-    monkeypatch.delenv("DNNL_MAX_CPU_ISA", raising=False)
-    if own:
-        monkeypatch.setenv("DNNL_MAX_CPU_ISA", own)
-    limit_kernels()
-    assert os.environ.pop("DNNL_MAX_CPU_ISA", "") == limit
+@pytest.mark.parametrize("channels", [(8,), (4, 8), (8, 7, 8)])
+def test_an_encoder_too_narrow_for_sound_gradients_is_refused(channels):
+    with pytest.raises(ValueError, match=r"channels .*: expected .* each at least 8"):
+        frame_encoder(channels, 16, 40)
