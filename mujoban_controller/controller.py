@@ -94,8 +94,10 @@ class ControllerOutput(NamedTuple):
     """Distribution over torques; mean and scale [B, T, U]."""
     features: Tensor
     """What the action rests on, [B, T, H + F]; auxiliary losses attach here."""
+    shown: Tensor | None
+    """What each frame shows of the heading, [B, T, 2]; None for a body that feels it."""
     heading: Tensor | None
-    """Unit vectors in which the robots face as far as is seen, [B, T, 2]; None for a body that feels it."""
+    """Unit vectors in which the robots face as far as is known, [B, T, 2]; None for a body that feels it."""
     memory: Recurrent
     """Memory after the last tick."""
 
@@ -187,7 +189,7 @@ class VisuomotorController(GoalPolicy, Controller):
         return encode_frames(self.encoder, seen, dtype, mixed_precision=self.mixed_precision)
 
     def reckon(
-        self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor, seen: Tensor
+        self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor, shown: Tensor | None
     ) -> Tensor:
         """Return the track after one more tick, [B, 7 or 10].
 
@@ -196,15 +198,15 @@ class VisuomotorController(GoalPolicy, Controller):
             instruction: A, int64 [B].
             terminated: beta, bool [B].
             track: Before the tick; zeros at an episode's start.
-            seen: Features of the frame, [B, F].
+            shown: What the frame shows of the heading, [B, 2]; None for a body that feels it.
         """
         velocity = proprio[:, self.part.planar_velocity] / self.cell_size
         before = track[:, :_TRACK]
-        if self.compass is None:
+        if self.compass is None or shown is None:
             angle = proprio[:, self.heading_index]
             heading = torch.stack([angle.cos(), angle.sin()], -1)
             return dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
-        needle = self.compass(seen, proprio, track[:, _TRACK:_SIDE])
+        needle = self.compass(shown, proprio, track[:, _TRACK:_SIDE])
         heading, side = heading_of(needle), track[:, _SIDE].long()
         # Chosen for each instruction; and anew where the robot turned, or was mistaken about its heading.
         away = self.sides.relative(heading, instruction, side)[:, 0] < _AWAY
@@ -270,10 +272,11 @@ class VisuomotorController(GoalPolicy, Controller):
         keep = torch.ones_like(proprio[..., :1]) if first is None else (~first[..., None]).to(proprio.dtype)
         h, c, track = memory
         seen = self.encode(frame.flatten(0, 1))
-        shown, tracks = seen.view(b, t, -1), list[Tensor]()
+        shown = None if self.compass is None else self.compass.read(seen).view(b, t, -1)
+        tracks = []
         for i in range(t):
-            past = track * keep[:, i]
-            track = self.reckon(proprio[:, i], instruction[:, i], terminated[:, i], past, shown[:, i])
+            past, sight = track * keep[:, i], None if shown is None else shown[:, i]
+            track = self.reckon(proprio[:, i], instruction[:, i], terminated[:, i], past, sight)
             tracks.append(track)
         tracked = torch.stack(tracks, 1).flatten(0, 1)
         felt = self.embed(proprio.flatten(0, 1), instruction.flatten(), terminated.flatten(), tracked)
@@ -286,7 +289,8 @@ class VisuomotorController(GoalPolicy, Controller):
         features = torch.cat([torch.stack(outputs, 1), mixed], -1)
         tracked = tracked.view(b, t, -1)
         heading = None if self.compass is None else heading_of(tracked[..., _TRACK:_SIDE])
-        return ControllerOutput(self.distribution(features, tracked), features, heading, Recurrent(h, c, track))
+        action = self.distribution(features, tracked)
+        return ControllerOutput(action, features, shown, heading, Recurrent(h, c, track))
 
     def over_windows(self, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
         """Return the distributions in the ticks of windows [M, W, ...] from number `skipped` on, [M, W - n, U].

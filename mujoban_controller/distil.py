@@ -110,11 +110,12 @@ def imitation_loss(
     kind = functional.cross_entropy(logits.flatten(0, 1), batch["kind"].flatten())
     loss = action + 0.01 * spread + config.goal_weight * goal + config.kind_weight * kind
     stats = {}
-    if output.heading is not None:
+    if output.shown is not None and output.heading is not None:
         truth = torch.stack([batch["heading"].cos(), batch["heading"].sin()], -1)
-        turned = 1.0 - (output.heading * truth).sum(-1)
-        loss = loss + config.heading_weight * turned.mean()
-        stats["error/heading_degrees"] = turned.clamp(0.0, 2.0).neg().add(1.0).acos().rad2deg().median()
+        # Squares make it the mean of what may be: short where a frame shows little.
+        loss = loss + config.heading_weight * functional.mse_loss(output.shown, truth)
+        off = (output.heading * truth).sum(-1).clamp(-1.0, 1.0).acos()
+        stats["error/heading_degrees"] = off.rad2deg().median()
     stats |= {
         "loss/action": action,
         "loss/goal": goal,

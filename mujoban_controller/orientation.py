@@ -2,7 +2,8 @@
 
 The ball's steer joint is its heading. A body on a free root has a gyro alone, whose turns sum up to a heading since the
 start of the episode; how that lies in the map only the skyline shows, which is the same in all episodes. So a needle is
-kept: what the frame shows of the heading is added to it in each tick, and it turns with the robot in between.
+kept: what the frame shows of the heading is added to it in each tick, the longer the surer, and it turns with the robot
+in between.
 
 A body that is alike from all sides needs not turn round: it puts the side ahead that faces where the instruction leads.
 
@@ -29,7 +30,7 @@ _SHORTEST: Final = 1e-3
 
 
 class Compass(nn.Module):
-    """The needle; has a layer that reads the heading from a frame's features."""
+    """The needle; has a layer, `read`, that reads the heading from a frame's features, [M, F] to [M, 2]."""
 
     def __init__(self, body: Body, features: int) -> None:
         """Read F features."""
@@ -37,11 +38,11 @@ class Compass(nn.Module):
         self._part = body.proprio
         self.read = nn.Linear(features, NEEDLE)
 
-    def forward(self, seen: Tensor, proprio: Tensor, needle: Tensor) -> Tensor:
+    def forward(self, shown: Tensor, proprio: Tensor, needle: Tensor) -> Tensor:
         """Return the needle after one more tick, [B, 2].
 
         Args:
-            seen: Features of the frame, [B, F].
+            shown: What was read from the frame: the mean of unit vectors that may be the heading, [B, 2].
             proprio: o_pr, [B, P].
             needle: Before the tick, [B, 2]; zeros at an episode's start.
         """
@@ -49,7 +50,7 @@ class Compass(nn.Module):
         rate = (proprio[:, self._part.angular_velocity] * proprio[:, self._part.up_axis]).sum(-1)
         cos, sin = (CONTROL_PERIOD * rate).cos(), (CONTROL_PERIOD * rate).sin()
         x, y = needle.unbind(-1)
-        return _KEPT * torch.stack([cos * x - sin * y, sin * x + cos * y], -1) + self.read(seen)
+        return _KEPT * torch.stack([cos * x - sin * y, sin * x + cos * y], -1) + shown
 
 
 def heading_of(needle: Tensor) -> Tensor:
