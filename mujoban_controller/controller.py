@@ -26,11 +26,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_controller.drivers import ControllerDriver, Driver
+from mujoban_controller.goal_features import AWAY
 from mujoban_controller.orientation import NEEDLE, Compass, Sides, heading_of
 from mujoban_controller.policy import GoalPolicy
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
+from mujoban_core.grid import CONTROL_PERIOD, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
 from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder, gaussian, gaussian_layers, rows_of_sky
 
@@ -41,8 +42,6 @@ MEMORY_FIELDS = ("memory0", "memory1", "memory2")
 _CLIP = 5.0
 _TRACK = 7
 _SIDE = _TRACK + NEEDLE
-_AWAY = 0.5
-"""Cosine of the angle between the side ahead and the instruction from which on another side is put ahead."""
 
 
 class Recurrent(NamedTuple):
@@ -112,7 +111,6 @@ class VisuomotorController(GoalPolicy, Controller):
     acts_ahead = False
     proprio_mean: Tensor
     proprio_scale: Tensor
-    axes: Tensor
 
     def __init__(
         self,
@@ -160,7 +158,6 @@ class VisuomotorController(GoalPolicy, Controller):
         self.mean, self.scale = gaussian_layers(features, self.action_size)
         self.register_buffer("proprio_mean", torch.zeros(self.proprio_size))
         self.register_buffer("proprio_scale", torch.ones(self.proprio_size))
-        self.register_buffer("axes", torch.tensor(INSTRUCTION_AXES, dtype=torch.float32), persistent=False)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     @property
@@ -209,7 +206,7 @@ class VisuomotorController(GoalPolicy, Controller):
         needle = self.compass(shown, proprio, track[:, _TRACK:_SIDE])
         heading, side = heading_of(needle), track[:, _SIDE].long()
         # Chosen for each instruction; and anew where the robot turned, or was mistaken about its heading.
-        away = self.sides.relative(heading, instruction, side)[:, 0] < _AWAY
+        away = self.sides.relative(heading, instruction, side)[:, 0] < AWAY
         new = terminated | (before[:, -1] == 0) | away
         side = torch.where(new, self.sides.ahead(heading, instruction), side)
         place = dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
@@ -231,7 +228,7 @@ class VisuomotorController(GoalPolicy, Controller):
         """
         part = self.part
         # Shape [M, 1] each.
-        axis = tuple(x[:, None] for x in self.axes[instruction].unbind(-1))
+        axis = tuple(x[:, None] for x in self.sides.axes[instruction].unbind(-1))
         if self.compass is None:
             angle = proprio[:, part.joint_position]
             normal = self._normal(proprio)

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import feature_layout, goal_offsets, privileged_features, side_ahead, wrap
+from mujoban_controller.goal_features import AWAY, feature_layout, goal_offsets, privileged_features, side_ahead
 from mujoban_controller.goal_rewards import GoalReward, fallen
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.instructions import TerminationNoise, feasible_kinds, random_instruction
@@ -261,9 +261,9 @@ class GoalTask:
 
     def put_ahead(self, side: NDArray[np.int64]) -> None:
         """Put the sides ahead, [B], that a policy chooses, where they are less than 60 degrees off the instruction."""
-        course = OFFSETS_XY[self.instruction]
-        off = wrap(np.arctan2(course[:, 1], course[:, 0]) - self.world.pose[:, 2] - side * (np.pi / 2))
-        facing = (self.instruction != int(Instruction.STAY)) & (np.abs(off) < np.pi / 3)
+        angle = self.world.pose[:, 2] + side * (np.pi / 2)
+        # With STAY there is no direction to face, and the product is zero.
+        facing = (OFFSETS_XY[self.instruction] * np.stack([np.cos(angle), np.sin(angle)], 1)).sum(1) > AWAY
         self.side = np.where(facing, side, self.side)
 
     def _turn_sides(self, issued: NDArray[np.int64]) -> None:

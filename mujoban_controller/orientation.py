@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from mujoban_controller.goal_features import feature_layout
 from mujoban_core.bodies import Body
-from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction
+from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
 
 NEEDLE: Final = 2
 """Components of the needle: along the map's x-axis and its y-axis."""
@@ -91,12 +91,9 @@ class Sides(nn.Module):
 
     def relative(self, heading: Tensor, instruction: Tensor, side: Tensor) -> Tensor:
         """Return the direction of instructions as the side ahead sees it, (ahead, left), [M, 2]."""
-        ahead, left = heading.unbind(-1)
-        axis_x, axis_y = self.axes[instruction].unbind(-1)
-        x, y = axis_x * ahead + axis_y * left, axis_y * ahead - axis_x * left
+        front = turn_to_instruction(*self.axes[instruction].unbind(-1), *heading.unbind(-1))
         quarter = side * (math.pi / 2)
-        cos, sin = quarter.cos(), quarter.sin()
-        return torch.stack([x * cos + y * sin, y * cos - x * sin], -1)
+        return torch.stack(turn_to_instruction(*front, quarter.cos(), quarter.sin()), -1)
 
     def felt(self, proprio: Tensor, side: Tensor) -> Tensor:
         """Return proprioception as the side ahead sees it, [M, P]."""
