@@ -28,6 +28,8 @@ from mujoban_sokoban.episodes import Episodes
 
 _AHEAD: Final = 100 * topics.TICK
 """Simulated time [ns] by which modules may be heard before the simulator; what is further ahead is a stranger's."""
+_PATIENCE: Final = 5.0
+"""Seconds without a word of the simulator after which the last end that was heard counts as it is."""
 _WATCHED = (topics.INSTRUCTION, topics.TERMINATION, topics.ABSTRACT_STATE, topics.TRUE_ABSTRACT_STATE)
 """What tells what the modules decided."""
 _WATCHED_ALONE = (topics.TORQUE, topics.TRUE_ABSTRACT_STATE)
@@ -111,6 +113,9 @@ class MonitorNode(EndingNode):
         self._sequence = 0
         self._joined = -1
         self._end: EpisodeTruth | None = None
+        self._doubted: EpisodeTruth | None = None
+        self._heard = time.monotonic()
+        self.create_timer(_PATIENCE / 10, self._end_in_silence)
         qos = live_qos(depth=1024)
         listen(self, topics.TRUE_EPISODE, self._on_episode, qos=qos, decode=checked(topics.TRUE_EPISODE))
         for topic in watched:
@@ -143,12 +148,13 @@ class MonitorNode(EndingNode):
         if message.seed not in self._episodes.seeds or message.difficulty != self._episodes.difficulty:
             refuse_run(self, f"it plays seed {message.seed} at difficulty {message.difficulty}")
             return
+        self._heard = time.monotonic()
         if self._end is not None and message.episode == self._end.episode:
-            # The episode goes on, so that its end was not the simulator's word.
+            # The episode goes on, so that its end was not the simulator's word; or a stranger says that it does.
             if message.header.stamp != self._end.header.stamp:
-                self._end = None
+                self._doubted, self._end = self._end, None
                 self.counts["contradictory episodes"] += 1
-        elif self._end is not None:
+        elif self._end is not None or (self._doubted is not None and message.episode != self._doubted.episode):
             self._finish()
         self._started = self._started or time.perf_counter()
         if self.episode is None or message.episode != self.episode.episode:
@@ -186,8 +192,18 @@ class MonitorNode(EndingNode):
         if self._end is not None and self._joined >= conversions.stamp_of(self._end) - topics.TICK:
             self._finish()
 
+    def _end_in_silence(self) -> None:
+        """End an episode of which nothing more is heard.
+
+        In real time the tick before its last may stay without an answer, and a stranger may have denied its end.
+        """
+        ended = self._end is not None or self._doubted is not None
+        if ended and time.monotonic() - self._heard > _PATIENCE:
+            self._finish()
+
     def _finish(self) -> None:
-        end, self._end = self._end, None
+        end = self._end or self._doubted
+        self._end = self._doubted = None
         assert end is not None
         self._ended = time.perf_counter()
         # In real time, or of a stranger, an end may be heard before any tick.

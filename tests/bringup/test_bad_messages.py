@@ -96,12 +96,12 @@ def say_end(play_graph):
     mouth = graph.tap.create_publisher(topic.type, topic.name, topic.qos)
     graph.spin_until(lambda: mouth.get_subscription_count() == 2)
 
-    def say(seed, difficulty=1):
+    def say(seed, difficulty=1, *, tick=0, truncated=True):
         reading = conversions.EpisodeTruthReading(
             episode=seed + 1, seed=seed, difficulty=difficulty, level=generate_level(1, 0).to_text(), step=9, reward=0,
-            episode_return=0.0, solved=False, terminated=False, truncated=True, boxes_on_target=1,
+            episode_return=0.0, solved=False, terminated=False, truncated=truncated, boxes_on_target=1,
         )  # fmt: skip
-        mouth.publish(conversions.episode_truth_to_msg(conversions.header((seed + 1) * topics.TICK), reading))
+        mouth.publish(conversions.episode_truth_to_msg(conversions.header((tick or seed + 1) * topics.TICK), reading))
 
     return graph, say
 
@@ -112,6 +112,15 @@ def test_an_end_that_is_heard_before_any_tick_ends_its_episode_alone(say_end):
     say(1)
     graph.spin_until(lambda: graph.monitor.results)
     assert graph.monitor.results[0].steps == 9 and not graph.monitor.results[0].solved
+
+
+def test_the_last_end_counts_when_nothing_more_is_heard_though_no_tick_was_answered_or_a_stranger_denies_it(say_end):
+    graph, say = say_end
+    say(0, tick=3)
+    say(0, tick=2, truncated=False)  # who says so does not go on
+    say(1, tick=5)
+    assert [result.seed for result in graph.finish()] == [0, 1]
+    assert graph.monitor.counts["contradictory episodes"] == 1
 
 
 @pytest.mark.parametrize(("seed", "difficulty"), [(77, 1), (0, 2)])
