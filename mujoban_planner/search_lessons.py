@@ -67,6 +67,8 @@ class SearchConfig:
     """Share of searches that start from where the planner's own play leads; the others start from a level's start."""
     lead: int = 16
     """Pushes of such play at most."""
+    stray: float = 0.5
+    """Chance of the last of these pushes to be any that is possible, rather than one that the planner would choose."""
     presumed: float = 0.1
     """States alive at most, as a share of those that searches after own play leave open, for these to count as dead."""
     verdicts: int = 6
@@ -192,13 +194,15 @@ class SearchActor(Actor):
         return config.expansions << np.array(doublings, np.int64)
 
     def _play(self, row: int, lead: _Lead) -> None:
-        """Push once by chance, as the planner's probabilities are, in a tree whose first node was just expanded."""
+        """Push once by chance, as the planner would or astray, in a tree whose first node was just expanded."""
         trees = self._forest.trees
         children = np.arange(1, trees.nodes[row])
         if trees.solution[row] >= 0 or not children.size:
             lead.pushes_left = 0
             return
         chances = np.exp(trees.logp[row, children].astype(np.float64))
+        if lead.pushes_left == 1 and self._rng.random() < self.config.stray:
+            chances[:] = 1.0
         child = int(self._rng.choice(children, p=chances / chances.sum()))
         lead.states.append((int(trees.box[row, 0]), int(trees.agent[row, 0]), int(trees.push[row, child])))
         lead.pushes_left -= 1
