@@ -15,8 +15,8 @@ from typing import IO, Final
 _PARENT: Final = "MUJOBAN_PARENT"
 """Environment variable that names the process which started this one."""
 _PR_SET_PDEATHSIG: Final = 1
-GRACE: Final = 1.0
-"""Seconds that a process has to end when it is asked to."""
+GRACE: Final = 0.5
+"""Seconds that a process has to end when it is asked to; who asks has to end within two, on a busy machine as well."""
 
 
 def start(
