@@ -4,9 +4,7 @@ Levin search, guided by the planner, solves what the planner alone does not; the
 found, and so guides the next searches better. Many searches run at once, each of a step per network evaluation; one
 that ends makes room for the next level, and a level that was not solved comes again with twice the budget. Two things
 are learned from a search: the way that it found, in every state along it, and which pushes it proved deadly or safe
-(`forest.Forest.judge`). Nobody but the rules says what is right. A push of the planner's own play, after which a search
-finds neither a solution nor a proof, counts as deadly once searches hardly miss solutions (`presumption.Presumption`):
-else what is hard to prove would be shown to be safe, or not at all.
+(`forest.Forest.judge`). Nobody but the rules says what is right.
 
 Shapes: M trees, R rows, S samples.
 """
@@ -26,7 +24,6 @@ from mujoban_core.grid import DIFFICULTIES
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import BitBoards, level_batch
 from mujoban_planner.forest import Forest, Verdicts
-from mujoban_planner.presumption import Presumption
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch, unlabelled
 from mujoban_planner.search import grow
 from mujoban_planner.symmetry import SYMMETRIES
@@ -59,18 +56,12 @@ class SearchConfig:
     """Share of such levels."""
     steps: int = 8
     """Steps of every search that are delivered at once."""
-    straight: float = 0.25
-    """Share that is kept of searches which went straight to a solution: the planner knew the way."""
     walks: float = 0.25
     """Share that is kept of the states between two pushes."""
     led: float = 0.5
     """Share of searches that start from where the planner's own play leads; the others start from a level's start."""
     lead: int = 16
     """Pushes of such play at most."""
-    stray: float = 0.5
-    """Chance of the last of these pushes to be any that is possible, rather than one that the planner would choose."""
-    presumed: float = 0.1
-    """States alive at most, as a share of those that searches after own play leave open, for these to count as dead."""
     verdicts: int = 6
     """States off the way, of each search, whose proven verdicts are kept."""
     judged: float = 0.4
@@ -115,7 +106,6 @@ class SearchActor(Actor):
         self._forest = Forest(config.trees, config.expansions << config.retries, MOVE_LIMIT)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
         self._leads = [_Lead(0) for _ in range(config.trees)]
-        self._presumption = Presumption(config.retries + 1)
         self._rng = np.random.default_rng([stream, 4])
 
     def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
@@ -131,7 +121,6 @@ class SearchActor(Actor):
         arrays = {f"{k}.{n}": column for k, v in lessons.items() for n, column in concatenate(v)._asdict().items()}
         arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         statistics = {name: np.array(solved, np.float32) for name, solved in ended.items()}
-        statistics["search/wrongly_presumed"] = np.array([self._presumption.error], np.float32)
         return Experience(arrays, self.config.trees * self.config.steps, statistics)
 
     def state(self) -> State:
@@ -139,14 +128,12 @@ class SearchActor(Actor):
         leads = [[lead.pushes_left, [list(state) for state in lead.states]] for lead in self._leads]
         tickets = [list(ticket) for ticket in self._tickets]
         own = State({"rng": self._rng.bit_generator.state, "tickets": tickets, "leads": leads})
-        parts = {"levels": self._levels, "forest": self._forest, "presumption": self._presumption}
-        return State.of({"own": own} | {name: part.state() for name, part in parts.items()})
+        return State.of({"own": own, "levels": self._levels.state(), "forest": self._forest.state()})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         self._levels.restore(state.part("levels"))
         self._forest.restore(state.part("forest"))
-        self._presumption.restore(state.part("presumption"))
         own = state.part("own").values
         self._rng.bit_generator.state = own["rng"]
         self._tickets = [Ticket(*ticket) for ticket in own["tickets"]]
@@ -159,7 +146,11 @@ class SearchActor(Actor):
         if over.size:
             planted = over[forest.trees.nodes[over] > 0]  # none is at first
             for row in planted.tolist():
-                self._report(row, ended)
+                ticket, solved = self._tickets[row], bool(forest.trees.solution[row] >= 0)
+                if not self._leads[row].states:
+                    self._levels.report(ticket, solved)
+                    if ticket.failures == 0:
+                        ended[f"search/{ticket.difficulty}"].append(solved)
             self._learn(planted, lessons)
             boards, tickets = self._levels.draw(len(over))
             forest.plant(over, boards)
@@ -172,18 +163,6 @@ class SearchActor(Actor):
             if lead.pushes_left:
                 self._play(row, lead)
 
-    def _report(self, row: int, ended: dict[str, list[bool]]) -> None:
-        """Take note of how a search has ended."""
-        ticket, solved = self._tickets[row], bool(self._forest.trees.solution[row] >= 0)
-        if self._leads[row].states:
-            if solved or self._forest.open[row]:
-                self._presumption.note_state(solved=solved)
-            return
-        self._levels.report(ticket, solved)
-        self._presumption.note_level(ticket.failures, solved=solved)
-        if ticket.failures == 0:
-            ended[f"search/{ticket.difficulty}"].append(solved)
-
     def _budgets(self) -> NDArray[np.int64]:
         """Return the expansions that each search may take, [M]; those after own play have most to prove."""
         config = self.config
@@ -194,30 +173,22 @@ class SearchActor(Actor):
         return config.expansions << np.array(doublings, np.int64)
 
     def _play(self, row: int, lead: _Lead) -> None:
-        """Push once by chance, as the planner would or astray, in a tree whose first node was just expanded."""
+        """Push once by chance, as the planner's probabilities are, in a tree whose first node was just expanded."""
         trees = self._forest.trees
         children = np.arange(1, trees.nodes[row])
         if trees.solution[row] >= 0 or not children.size:
             lead.pushes_left = 0
             return
         chances = np.exp(trees.logp[row, children].astype(np.float64))
-        if lead.pushes_left == 1 and self._rng.random() < self.config.stray:
-            chances[:] = 1.0
         child = int(self._rng.choice(children, p=chances / chances.sum()))
         lead.states.append((int(trees.box[row, 0]), int(trees.agent[row, 0]), int(trees.push[row, child])))
         lead.pushes_left -= 1
         self._forest.plant(np.array([row]), self._forest.boards(row, np.array([child])))
 
-    def _teaches(self, row: int) -> bool:
-        """Tell whether a search that has ended is learned from; by chance if it went straight to a solution."""
-        forest = self._forest
-        straight = forest.trees.solution[row] >= 0 and forest.expansions[row] == len(forest.way(row))
-        return not straight or self._rng.random() < self.config.straight
-
     def _learn(self, rows: NDArray[np.int64], lessons: dict[str, list[Samples]]) -> None:
         """Add what the searches in trees `rows`, [R], found and proved."""
         forest, config = self._forest, self.config
-        verdicts = {row: forest.judge(row) for row in rows.tolist() if self._teaches(row)}
+        verdicts = {row: forest.judge(row) for row in rows.tolist()}
         solved = {row: proved for row, proved in verdicts.items() if len(forest.way(row))}
         if solved:
             ways = label_ways(forest, solved, self._rng)
@@ -227,10 +198,8 @@ class SearchActor(Actor):
         judged = [label_verdicts(forest, row, verdicts[row], config.verdicts, self._rng) for row in searched]
         lessons["verdict"] += judged
         for row, proved in verdicts.items():
-            solved, lost = bool(forest.trees.solution[row] >= 0), bool(proved.lost[0])
-            presumed = bool(forest.open[row]) and self._presumption.error < config.presumed
-            if self._leads[row].states and (solved or lost or presumed):
-                lessons["verdict"].append(_label_lead(forest, row, self._leads[row], lost=not solved))
+            if self._leads[row].states and (proved.lost[0] or forest.trees.solution[row] >= 0):
+                lessons["verdict"].append(_label_lead(forest, row, self._leads[row], lost=bool(proved.lost[0])))
 
 
 class LessonStore:
@@ -309,7 +278,7 @@ def label_verdicts(
 
 
 def _label_lead(forest: Forest, row: int, lead: _Lead, *, lost: bool) -> Samples:
-    """Return what the end of a search says of the pushes before it: of a dead state the last, else all are judged."""
+    """Return what the end of a search says of the pushes before it: of a lost state the last, else all are judged."""
     states = lead.states[-1:] if lost else lead.states
     n = len(states)
     box, agent = np.array([x for x, _, _ in states], np.uint64), np.array([x for _, x, _ in states], np.uint8)

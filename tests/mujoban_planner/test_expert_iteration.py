@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from mujoban_planner.boards import BitBoards, bit_boards, level_batch
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.forest import Forest
 from mujoban_planner.networks import ResidualPlanner
-from mujoban_planner.presumption import Presumption
 from mujoban_planner.samples import Samples
 from mujoban_planner.search import grow
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
@@ -30,8 +28,7 @@ SMALL = SearchConfig(trees=16, expansions=20, buffer=4000, steps=16, batch_size=
 def lessons():
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    proving = replace(SMALL, presumed=0.0)
-    actor, store = SearchActor(NETWORK, proving, 0), LessonStore(proving, 0)
+    actor, store = SearchActor(NETWORK, SMALL, 0), LessonStore(SMALL, 0)
     for _ in range(8):
         store.add(actor.act())
     return {kind: buffer.storage.take(np.arange(min(buffer.size, 400))) for kind, buffer in store.buffers.items()}
@@ -79,36 +76,6 @@ def test_a_search_that_has_looked_everywhere_proves_a_level_lost():
     expected = solve_batch(stack_levels([dead])).status[0] == Status.UNSOLVABLE
     assert bool(verdicts.lost[0]) == expected and bool(verdicts.solvable[0]) == (not expected)
     assert steps == forest.expansions[0]
-
-
-def test_the_share_of_open_states_that_are_alive_is_estimated_from_levels_which_all_are():
-    presumption, rng = Presumption(2), np.random.default_rng(0)
-    assert presumption.error == 1.0
-    alive = []
-    for _ in range(4000):
-        if rng.random() < 0.5:  # a level: missed by 0.4 of first tries, and by 0.1 of those that follow
-            presumption.note_level(0, solved=rng.random() > 0.4)
-            presumption.note_level(1, solved=rng.random() > 0.1)
-        elif rng.random() < 0.3:  # a dead state that the search does not prove dead
-            presumption.note_state(solved=False)
-            alive.append(0.0)
-        elif rng.random() < 0.04:
-            presumption.note_state(solved=False)
-            alive.append(1.0)
-        else:
-            presumption.note_state(solved=True)
-    assert presumption.error == pytest.approx(np.mean(alive), abs=0.04)
-
-
-def test_states_left_open_count_as_dead_once_they_hardly_can_be_alive():
-    deadly = {}
-    for presumed in (0.0, 2.0):
-        torch.manual_seed(0)
-        actor = SearchActor(NETWORK, replace(SMALL, presumed=presumed, retries=0, led=1.0, steps=60), 0)
-        arrays = actor.act().arrays
-        samples = Samples._make(arrays[f"verdict.{name}"] for name in Samples._fields)
-        deadly[presumed] = judged_pushes(samples)[-1].sum()
-    assert deadly[2.0] > deadly[0.0] + 10
 
 
 def test_levels_that_were_not_solved_come_again_and_the_mix_follows_what_is_solved():
