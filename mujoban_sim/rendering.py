@@ -60,13 +60,16 @@ def open_context(size: int) -> GLContext:
     """Open an offscreen OpenGL context and make it current in the calling thread.
 
     The variable MUJOCO_GL chooses the library (``egl``, the default, ``osmesa`` or ``glfw``). Mesa's software
-    renderer is told to draw in the calling thread: threads of its own cost more than they bring at this size.
+    renderer is told to draw in the calling thread: threads of its own cost more than they bring at this size. Its cache
+    of shaders on disk, which makes nothing quicker here, is off: a thread of least priority keeps it, and no process
+    ends before its last thread, which a busy machine gives its turn after seconds.
 
     Raises:
         RenderingError: if there is none; names the Debian packages to install.
     """
     backend = os.environ.get("MUJOCO_GL", "").strip().lower() or "egl"
     os.environ.setdefault("LP_NUM_THREADS", "0")
+    os.environ.setdefault("MESA_SHADER_CACHE_DISABLE", "true")
     if backend not in BACKENDS:
         raise RenderingError(f"MUJOCO_GL is {backend!r}, expected one of {', '.join(BACKENDS)}, or nothing")
     try:

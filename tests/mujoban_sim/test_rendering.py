@@ -1,6 +1,8 @@
 import dataclasses
 import gc
 import importlib
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -307,3 +309,12 @@ def test_full_walls_hide_what_is_behind_them_and_boxes_are_looked_over(preset, s
         assert name_of(pixel_at(over, (0.0, 0.5, 0.3), far)) is None
     finally:
         renderer.close()
+
+
+def test_drawing_leaves_no_thread_of_low_priority_that_would_hold_up_the_end_of_the_process_on_a_busy_machine():
+    program = (
+        "import os; from pathlib import Path; from mujoban_sim.rendering import open_context; open_context(64);"
+        "tasks = [int(path.name) for path in Path('/proc/self/task').iterdir()];"
+        "print({os.getpriority(os.PRIO_PROCESS, task) - os.getpriority(os.PRIO_PROCESS, 0) for task in tasks})"
+    )
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout == "{0}\n"
