@@ -30,6 +30,8 @@ _AHEAD: Final = 100 * topics.TICK
 """Simulated time [ns] by which modules may be heard before the simulator; what is further ahead is a stranger's."""
 _PATIENCE: Final = 5.0
 """Seconds without a word of the simulator after which the last end that was heard counts as it is."""
+_REFUTED: Final = 10
+"""Ticks that the graph answers after an end was denied, until that is forgotten; fewer may still be on their way."""
 _WATCHED = (topics.INSTRUCTION, topics.TERMINATION, topics.ABSTRACT_STATE, topics.TRUE_ABSTRACT_STATE)
 """What tells what the modules decided."""
 _WATCHED_ALONE = (topics.TORQUE, topics.TRUE_ABSTRACT_STATE)
@@ -114,6 +116,7 @@ class MonitorNode(EndingNode):
         self._joined = -1
         self._end: EpisodeTruth | None = None
         self._doubted: EpisodeTruth | None = None
+        self._doubted_at = 0
         self._heard = time.monotonic()
         self.create_timer(_PATIENCE / 10, self._end_in_silence)
         qos = live_qos(depth=1024)
@@ -152,7 +155,7 @@ class MonitorNode(EndingNode):
         if self._end is not None and message.episode == self._end.episode:
             # The episode goes on, so that its end was not the simulator's word; or a stranger says that it does.
             if message.header.stamp != self._end.header.stamp:
-                self._doubted, self._end = self._end, None
+                self._doubted, self._end, self._doubted_at = self._end, None, self.ticks
                 self.counts["contradictory episodes"] += 1
         elif self._end is not None or (self._doubted is not None and message.episode != self._doubted.episode):
             self._finish()
@@ -173,6 +176,8 @@ class MonitorNode(EndingNode):
     def _on_tick(self, tick: Watched) -> None:
         self.latest = tick
         self.ticks += 1
+        if self.ticks - self._doubted_at > _REFUTED:
+            self._doubted = None  # the episode does go on
         said = None if tick.alone else tick.instruction
         if said is not None and said.sequence != self._sequence:
             self._sequence = said.sequence

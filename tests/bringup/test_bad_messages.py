@@ -1,5 +1,6 @@
 """Whatever anybody publishes on the graph's topics, the episode goes on, and the stranger is named."""
 
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -123,6 +124,35 @@ def test_the_last_end_counts_when_nothing_more_is_heard_though_no_tick_was_answe
     assert graph.monitor.counts["contradictory episodes"] == 1
 
 
+def _say_tick(monitor, tick):
+    """Have the monitor hear what the modules of a graph say in a tick."""
+    stamp, state = tick * topics.TICK, np.zeros((10, 10, 4), np.float32)
+    header = conversions.header(stamp)
+    for topic, message in (
+        (topics.INSTRUCTION, conversions.instruction_to_msg(header, 1, 1)),
+        (topics.TERMINATION, conversions.termination_to_msg(header, 1, 0.0, False)),
+        (topics.ABSTRACT_STATE, conversions.abstract_state_to_msg(header, state)),
+        (topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_to_msg(header, state)),
+    ):
+        monitor._receive(topic.name, Received(stamp, DECODERS[topic](message), serialize_message(message)))
+
+
+def test_an_end_that_was_denied_is_forgotten_when_the_episode_goes_on_and_pauses(say_end, monkeypatch):
+    graph, say = say_end
+    say(0, tick=3)
+    say(0, tick=40, truncated=False)
+    graph.spin_until(lambda: graph.monitor.counts["contradictory episodes"] == 1)
+    for tick in range(30, 41):
+        _say_tick(graph.monitor, tick)
+    monkeypatch.setattr("bringup.monitor._PATIENCE", 0.1)
+    silent = time.monotonic()
+    graph.spin_until(lambda: time.monotonic() - silent > 1.5)  # three times as long as between two looks
+    assert not graph.monitor.results
+    say(0, tick=41)
+    say(1, tick=50)
+    assert [result.seed for result in graph.finish()] == [0, 1]
+
+
 @pytest.mark.parametrize(("seed", "difficulty"), [(77, 1), (0, 2)])
 def test_an_episode_of_another_run_is_no_result_of_this_one(say_end, seed, difficulty, capfd):
     graph, say = say_end
@@ -174,15 +204,7 @@ def test_messages_that_are_no_messages_are_named_by_topic(play_graph, capfd):
 def test_a_tick_from_far_ahead_does_not_keep_those_of_the_run_from_being_counted(play_graph):
     graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
     graph.spin_until(lambda: graph.monitor.ticks >= 2)
-    header, state = conversions.header(10**15), np.zeros((10, 10, 4), np.float32)
-    for topic, message in (
-        (topics.INSTRUCTION, conversions.instruction_to_msg(header, 1, 1)),
-        (topics.TERMINATION, conversions.termination_to_msg(header, 1, 0.0, False)),
-        (topics.ABSTRACT_STATE, conversions.abstract_state_to_msg(header, state)),
-        (topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_to_msg(header, state)),
-    ):
-        raw = serialize_message(message)
-        graph.monitor._receive(topic.name, Received(10**15, DECODERS[topic](message), raw))
+    _say_tick(graph.monitor, 10**15 // topics.TICK)
     ticks = graph.monitor.ticks
     graph.spin_until(lambda: graph.monitor.ticks > ticks + 3)
     assert graph.finish()[0].solved
