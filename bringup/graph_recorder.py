@@ -7,14 +7,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Unpack
 
-from rclpy.node import Node
-
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
 
@@ -25,7 +24,7 @@ MOST_EPISODES = 2**31 - 1
 """In one file."""
 
 
-class RecorderNode(Node):
+class RecorderNode(GraphNode):
     """Writes every tick of the graph, its topics in a fixed order and with simulated time as log time.
 
     A tick is written when all its topics have arrived; then `/recorded` says so. A simulator that awaits this in

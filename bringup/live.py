@@ -24,7 +24,6 @@ import numpy as np
 import rerun as rr
 from diagnostic_msgs.msg import DiagnosticArray
 from mujoban_msgs.msg import AbstractState, EpisodeTruth, Instruction, Termination
-from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
 
@@ -43,6 +42,7 @@ from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime import diagnostics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK, Topic
 
@@ -74,7 +74,7 @@ class _Received(NamedTuple):
     """Wall time [s]."""
 
 
-class LiveNode(Node):
+class LiveNode(GraphNode):
     """Logs cameras, grids, instruction, beta, torques, reward and the time that each module takes.
 
     A module's time runs from the message of the same tick that came before its own: where all nodes share one process

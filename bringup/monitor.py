@@ -21,7 +21,7 @@ from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import PublisherWatch, Received, listen, refuse_run
 from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
-from mujoban_msgs_py.runtime.ending_node import EndingNode
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_sokoban.episodes import Episodes
@@ -75,7 +75,7 @@ class Watched(NamedTuple):
         return self.values[topics.TRUE_ABSTRACT_STATE.name]
 
 
-class MonitorNode(EndingNode):
+class MonitorNode(GraphNode):
     """Turns the graph's messages into outcomes of episodes, as `bringup.rollout` does with its ticks.
 
     Attributes:

@@ -14,7 +14,6 @@ from typing import Any, Final, NamedTuple, Unpack
 import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.node import Node
 
 from bringup.overlay import Said, draw
 from mujoban_core.grid import CONTROL_PERIOD
@@ -22,6 +21,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_msgs_py.synchroniser import Synchroniser
 
@@ -52,7 +52,7 @@ class _Picture(NamedTuple):
     """Whether the episode ended here, so that no module has anything to say."""
 
 
-class VideoNode(Node):
+class VideoNode(GraphNode):
     """Writes H.264 in MP4 at the speed of simulated time, in a pixel format that browsers play.
 
     Attributes:

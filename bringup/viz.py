@@ -21,7 +21,6 @@ from geometry_msgs.msg import Point, Pose, Vector3
 from mujoban_msgs.msg import AbstractState
 from nav_msgs.msg import MapMetaData, OccupancyGrid
 from numpy.typing import NDArray
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import ColorRGBA, Header, String
@@ -35,6 +34,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 
 PREFIX: Final = "/viz"
@@ -50,7 +50,7 @@ _COLOURS: Final = {
 }
 
 
-class VizNode(Node):
+class VizNode(GraphNode):
     """Publishes the four layers of the estimate as occupancy grids and the true scene as markers.
 
     Topics: `/viz/estimate/<layer>` and `/viz/ground_truth/<layer>` (nav_msgs/OccupancyGrid, percent, frame `map`) for

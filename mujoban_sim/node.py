@@ -23,7 +23,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
-from mujoban_msgs_py.runtime.ending_node import EndingNode
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.kept import KeptArrays
 from mujoban_msgs_py.runtime.pace import Pace
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
@@ -70,7 +70,7 @@ PARAMETERS: Final[dict[str, tuple[Any, ParameterDescriptor]]] = {
 """Parameters of the simulator: their defaults, and what `ros2 param describe` says of them."""
 
 
-class SimulatorNode(EndingNode):
+class SimulatorNode(GraphNode):
     """Plays episodes, in lockstep with the graph or in real time.
 
     In lockstep the world steps when the torque and the instruction of the current stamp have arrived, so a run

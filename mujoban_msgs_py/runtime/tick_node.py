@@ -38,7 +38,7 @@ from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.discovery import confine_discovery
-from mujoban_msgs_py.runtime.ending_node import EndingNode
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.shared_memory import mapped_segments, release_segments
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
@@ -67,7 +67,7 @@ class Output(NamedTuple):
     """Bytes are one that is serialised already."""
 
 
-class TickNode(EndingNode):
+class TickNode(GraphNode):
     """A node that answers each tick of the simulator.
 
     Attributes:
