@@ -1,9 +1,9 @@
 """What bad input does to a run and to readers: `python -m benchmarks.fuzz [--messages N]` prints JSON.
 
-A run of the graph in a process of its own, in lockstep and in real time, is heard and answered by a node that says
-again, spoiled, whatever is said on every topic (`benchmarks.malformed`), and calls every service. Before, copies of a
-bag, of weights and of levels are damaged, one bit or one cut each, and read: each must be refused by name, or hold what
-it held before.
+A run of the graph, in one process and in one for each node, in lockstep and in real time, is heard and answered by a
+node that says again, spoiled, whatever is said on every topic (`benchmarks.malformed`), and then calls every service,
+those of parameters among them (`benchmarks.malformed_calls`). Before, copies of a bag, of weights and of levels are
+damaged, one bit or one cut each, and read: each must be refused by name, or hold what it held before.
 """
 
 from __future__ import annotations
@@ -30,21 +30,31 @@ from std_srvs.srv import SetBool, Trigger
 import mujoban_planner
 from benchmarks.command import run_benchmark
 from benchmarks.malformed import DEPTH, Vandal
-from benchmarks.running import ROOT, megabytes
+from benchmarks.malformed_calls import Caller
+from benchmarks.running import ROOT, family, megabytes
 from bringup.run_stack import main as play
 from mujoban_msgs_py.bags import open_bag
 from mujoban_rl.weights import record_path
 from mujoban_sokoban.generator import generate_level
 from mujoban_sokoban.levels import read_levels, write_levels
 
-MODES: dict[str, list[str]] = {"lockstep": [], "real time": ["--realtime", "4"]}
+_ORACLES = ["--oracle", "estimator,termination,planner,controller"]
+MODES: dict[str, list[str]] = {
+    "lockstep": _ORACLES,
+    "real time": [*_ORACLES, "--realtime", "4"],
+    "processes": ["--processes"],
+    "processes, real time": ["--processes", "--realtime", "4"],
+}
+"""Learned modules, of which parameters change the weights, in processes; oracles, which are faster, in one process."""
 _CALLS = (
-    ("/pause", SetBool, SetBool.Request(data=True)),
-    ("/step", Trigger, Trigger.Request()),
-    ("/reset", Trigger, Trigger.Request()),
-    ("/pause", SetBool, SetBool.Request(data=False)),
+    ("/pause", SetBool.Request(data=True)),
+    ("/step", Trigger.Request()),
+    ("/reset", Trigger.Request()),
+    ("/pause", SetBool.Request(data=False)),
 )
 """Services that are called every thousand messages; `megabytes` of the report are measured then, and before all."""
+ANSWERED = 10.0
+"""Seconds within which a service must have answered."""
 START = 300.0
 """Seconds until the first tick at most; on a busy machine a graph takes long to come up."""
 HANG = 30.0
@@ -60,23 +70,26 @@ class Options:
 
     messages: int = 10_000
     """On each topic, in each mode."""
+    calls: int = 10_000
+    """Of each service, in each mode."""
     rate: float = 500.0
     """Of them a second and topic."""
     bags: int = 200
     weights: int = 100
     levels: int = 100
     seed: int = 0
-    modes: tuple[Literal["lockstep", "real time"], ...] = ("lockstep", "real time")
+    modes: tuple[Literal["lockstep", "real time", "processes", "processes, real time"], ...] = (
+        "lockstep", "real time", "processes", "processes, real time",
+    )  # fmt: skip
 
 
 def attack(mode: str, options: Options) -> dict[str, Any]:
     """Return what became of a run that was attacked."""
     os.environ["ROS_DOMAIN_ID"] = str(60 + os.getpid() % 40)
-    oracles = ["--oracle", "estimator,termination,planner,controller"]
-    command = [sys.executable, "bringup/run_stack.py", "--headless", "--episodes", "100000", *oracles, *MODES[mode]]
+    command = [sys.executable, "bringup/run_stack.py", "--headless", "--episodes", "100000", *MODES[mode]]
     with tempfile.TemporaryFile("w+") as said:
         child = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said)
-        report = {"mode": mode, **_attack(child, options)}
+        report = {"mode": mode, **_Attack(child, options).report()}
         said.seek(0)
         text = said.read()
     report["last_line"] = next(reversed(text.split("\n")[:-1]), "")
@@ -85,52 +98,106 @@ def attack(mode: str, options: Options) -> dict[str, Any]:
     return report
 
 
-def _attack(child: subprocess.Popen[bytes], options: Options) -> dict[str, Any]:
-    rclpy.init()
-    vandal = Vandal(np.random.default_rng(options.seed))
-    executor = SingleThreadedExecutor()
-    executor.add_node(vandal)
+class _Attack:
+    """A run, and a node that attacks it."""
 
-    def spin(seconds: float) -> None:
+    def __init__(self, child: subprocess.Popen[bytes], options: Options) -> None:
+        rclpy.init()
+        rng = np.random.default_rng(options.seed)
+        self._child, self._options = child, options
+        self._vandal = Vandal(rng)
+        self._caller = Caller(self._vandal, rng)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._vandal)
+        self._stalls = self._hangs = 0
+        self._heard, self._since = 0, time.monotonic()
+        self._memory = list[int]()
+
+    def report(self) -> dict[str, Any]:
+        """Flood topics, then services; end the run and return what became of it."""
+        child, vandal, caller = self._child, self._vandal, self._caller
+        started = self._goes_on(START)
+        processes = {member.pid for member in family(child.pid)}
+        self._heard, self._since = vandal.heard, time.monotonic()
+        self._measure()
+        while started and not {name for name, _ in _CALLS} <= set(caller.services):
+            caller.meet()
+            self._spin(0.1)
+        if started:
+            self._flood_topics()
+            self._flood_services()
+        survived = started and self._goes_on(RECOVERY)
+        silent = [name for name in caller.services if not self._answers(name)]
+        lost = len(processes - {member.pid for member in family(child.pid)})
+        status = child.poll()
+        if status is None:
+            child.send_signal(signal.SIGINT)
+        child.wait(60)
+        rclpy.shutdown()
+        return {
+            "messages": sum(vandal.sent.values()), "calls": caller.sent.total(), "answered": caller.answered.total(),
+            "services": len(caller.services), "silent_services": silent, "ticks": vandal.heard, "started": started,
+            "crashed": status is not None, "lost_processes": lost, "stalls": self._stalls, "hangs": self._hangs,
+            "goes_on": survived, "status": child.returncode, "megabytes": self._memory,
+        }  # fmt: skip
+
+    def _flood_topics(self) -> None:
+        burst = 10
+        while self._child.poll() is None and self._vandal.sent["/clock"] < self._options.messages:
+            self._vandal.act(burst)
+            self._spin(burst / self._options.rate)
+            self._watch()
+            if self._vandal.sent["/clock"] % 1000 == 0:
+                self._measure()
+                for name, request in _CALLS:
+                    self._caller.call(name, request)
+                    self._spin(0.2)  # services are heard in any order
+
+    def _flood_services(self) -> None:
+        called, burst = 0, 10
+        while self._child.poll() is None and called < self._options.calls:
+            self._caller.meet()
+            self._caller.act(burst)
+            called += burst
+            end = time.monotonic() + ANSWERED
+            while self._caller.pending and time.monotonic() < end:
+                self._spin(0.01)
+            self._caller.call(*_CALLS[-1])
+            self._spin(0.05)
+            self._watch()
+            if called % 1000 == 0:
+                self._measure()
+
+    def _measure(self) -> None:
+        self._memory.append(sum(megabytes(member.pid) for member in family(self._child.pid)))
+
+    def _watch(self) -> None:
+        """Count stalls, and wait until they are over."""
+        if self._vandal.heard == self._heard and time.monotonic() - self._since > HANG:
+            self._stalls += 1
+            self._hangs += not self._goes_on(RECOVERY)
+            self._since = time.monotonic()
+        if self._vandal.heard != self._heard:
+            self._heard, self._since = self._vandal.heard, time.monotonic()
+
+    def _spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            executor.spin_once(timeout_sec=0.01)
+            self._executor.spin_once(timeout_sec=0.01)
 
-    def goes_on(seconds: float) -> bool:
+    def _goes_on(self, seconds: float) -> bool:
         """Wait for more ticks than the vandal may still have to hear of itself."""
-        enough, end = vandal.heard + DEPTH, time.monotonic() + seconds
-        while vandal.heard <= enough and time.monotonic() < end and child.poll() is None:
-            executor.spin_once(timeout_sec=0.01)
-        return vandal.heard > enough
+        enough, end = self._vandal.heard + DEPTH, time.monotonic() + seconds
+        while self._vandal.heard <= enough and time.monotonic() < end and self._child.poll() is None:
+            self._executor.spin_once(timeout_sec=0.01)
+        return self._vandal.heard > enough
 
-    started = goes_on(START)
-    clients = {name: vandal.create_client(kind, name) for name, kind, _ in _CALLS}
-    memory, stalls, hangs, heard, since = [megabytes(child.pid)], 0, 0, vandal.heard, time.monotonic()
-    while started and child.poll() is None and vandal.sent["/clock"] < options.messages:
-        burst = 10
-        vandal.act(burst)
-        spin(burst / options.rate)
-        if vandal.heard == heard and time.monotonic() - since > HANG:
-            stalls += 1
-            hangs += not goes_on(RECOVERY)
-            since = time.monotonic()
-        if vandal.heard != heard:
-            heard, since = vandal.heard, time.monotonic()
-        if vandal.sent["/clock"] % 1000 == 0:
-            memory.append(megabytes(child.pid))
-            for name, _, request in _CALLS:
-                clients[name].call_async(request)
-                spin(0.2)  # services are heard in any order
-    survived = started and goes_on(RECOVERY)
-    status = child.poll()
-    if status is None:
-        child.send_signal(signal.SIGINT)
-    child.wait(60)
-    rclpy.shutdown()
-    return {
-        "messages": sum(vandal.sent.values()), "ticks": vandal.heard, "started": started, "crashed": status is not None,
-        "stalls": stalls, "hangs": hangs, "goes_on": survived, "status": child.returncode, "megabytes": memory,
-    }  # fmt: skip
+    def _answers(self, service: str) -> bool:
+        """Return whether a service answers a sound call."""
+        future, end = self._caller.call(service), time.monotonic() + ANSWERED
+        while not future.done() and time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.01)
+        return future.done()
 
 
 def damage(paths: list[Path], read: Callable[[], Any], count: int, rng: np.random.Generator) -> Counter[str]:
@@ -160,8 +227,7 @@ def files(options: Options) -> dict[str, dict[str, int]]:
     rng = np.random.default_rng(options.seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        oracles = ["--oracle", "estimator,termination,planner,controller"]
-        play(["--headless", "--difficulty", "1", "--record", str(folder / "bag"), *oracles])
+        play(["--headless", "--difficulty", "1", "--record", str(folder / "bag"), *_ORACLES])
         for path in (mujoban_planner.SHIPPED, record_path(mujoban_planner.SHIPPED)):
             shutil.copy(path, folder)
         weights, levels = folder / mujoban_planner.SHIPPED.name, folder / "levels.txt"

@@ -49,7 +49,7 @@ def malform(kind: str, topic: Topic, message: bytes, rng: np.random.Generator) -
     if kind == "stamp":
         _move_stamp(content, rng)
     else:
-        _spoil(content, rng)
+        spoil(content, rng)
     return serialize_message(content)
 
 
@@ -60,13 +60,13 @@ def _move_stamp(content: Any, rng: np.random.Generator) -> None:
     time.sec, time.nanosec = int(np.clip(moved // 10**9, -(2**31), 2**31 - 1)), int(moved % 10**9)
 
 
-def _spoil(content: Any, rng: np.random.Generator) -> None:
-    """Give a field, at any depth, a value that its type allows and its topic does not."""
+def spoil(content: Any, rng: np.random.Generator) -> None:
+    """Give a field of a message, at any depth, a value that its type allows and its topic does not."""
     fields = list(content.get_fields_and_field_types().items())
     name, kind = fields[rng.integers(len(fields))]
     value = getattr(content, name)
     if hasattr(value, "get_fields_and_field_types"):
-        _spoil(value, rng)
+        spoil(value, rng)
     elif isinstance(value, array | list) and "sequence" in kind:
         setattr(content, name, _spoiled_sequence(value, rng))
     elif isinstance(value, np.ndarray):
@@ -100,7 +100,7 @@ def _spoiled_sequence(value: Any, rng: np.random.Generator) -> Any:
     if isinstance(spoiled, array) and spoiled.typecode in "fd":
         spoiled[int(rng.integers(len(spoiled)))] = _NUMBERS[rng.integers(len(_NUMBERS))]
     elif isinstance(spoiled, list) and hasattr(spoiled[0], "get_fields_and_field_types"):
-        _spoil(spoiled[int(rng.integers(len(spoiled)))], rng)
+        spoil(spoiled[int(rng.integers(len(spoiled)))], rng)
     return spoiled
 
 
