@@ -10,8 +10,10 @@ from rclpy.impl import rcutils_logger
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
+from std_srvs.srv import SetBool
 
 from benchmarks.malformed import TARGETS, Vandal
+from benchmarks.malformed_calls import Caller
 from bringup.graph_recorder import RecorderNode
 from bringup.viz import VizNode
 from mujoban_msgs_py import conversions, topics
@@ -41,6 +43,22 @@ def test_spoiled_messages_on_every_topic_end_nothing_and_what_is_recorded_is_sou
         assert node.counts["rejected messages"] >= 3, node.get_name()
     graph.graph.end(recorder)
     assert sum(1 for _ in open_bag(tmp_path / "bag").read()) > 100, "every recorded message can be read"
+
+
+def test_spoiled_calls_of_every_service_end_nothing_and_all_are_answered(play_graph):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
+    nodes = {"simulator", "monitor", *graph.graph.nodes}
+    caller = Caller(graph.tap, np.random.default_rng(0))
+    expected = {"/pause", "/reset", "/step", *(f"/{node}/set_parameters" for node in nodes)}
+    graph.spin_until(lambda: caller.meet() or expected <= set(caller.services))
+    for _ in range(8):
+        caller.act(4)
+        graph.spin_until(lambda: not caller.pending)
+    caller.call("/pause", SetBool.Request(data=False))
+    assert graph.finish()[0].solved
+    assert caller.answered == caller.sent
+    for name in nodes:
+        assert graph.graph.nodes.get(name, graph.monitor).counts["rejected messages"] >= 1, name
 
 
 @pytest.fixture
