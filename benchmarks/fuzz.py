@@ -18,6 +18,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -227,7 +228,8 @@ def files(options: Options) -> dict[str, dict[str, int]]:
     rng = np.random.default_rng(options.seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        play(["--headless", "--difficulty", "1", "--record", str(folder / "bag"), *_ORACLES])
+        with redirect_stdout(sys.stderr):
+            play(["--headless", "--difficulty", "1", "--record", str(folder / "bag"), *_ORACLES])
         for path in (mujoban_planner.SHIPPED, record_path(mujoban_planner.SHIPPED)):
             shutil.copy(path, folder)
         weights, levels = folder / mujoban_planner.SHIPPED.name, folder / "levels.txt"
