@@ -24,7 +24,6 @@ import psutil
 
 from benchmarks.command import run_benchmark
 from benchmarks.running import GIVE_UP, Run, cpu_seconds, family, lives, name_of
-from mujoban_core import children
 from mujoban_core.signals import interruptible
 from mujoban_msgs_py.bags import BagError, open_bag
 
@@ -146,12 +145,16 @@ def _look_at(folder: Path) -> list[str]:
 
 @contextmanager
 def busy(processes: int) -> Iterator[None]:
-    """Keep the machine busy."""
-    burners = [children.start([sys.executable, "-S", "-c", "while True: pass"]) for _ in range(processes)]
+    """Keep the machine busy, as from so many terminals: Linux deals time out to sessions first (`sched_autogroup`)."""
+    program = "import os\nparent = os.getppid()\nwhile os.getppid() == parent:\n    sum(range(100_000))"
+    command = [sys.executable, "-S", "-c", program]
+    burners = [subprocess.Popen(command, start_new_session=True) for _ in range(processes)]
     try:
         yield
     finally:
-        children.stop(burners)
+        for burner in burners:
+            burner.kill()
+            burner.wait()
 
 
 def run(options: Options | None = None) -> dict[str, Any]:
