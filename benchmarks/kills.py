@@ -2,8 +2,8 @@
 
 Each node runs in a process of its own, which is killed (SIGKILL) at moments drawn anew and started again by the graph.
 Printed are, for each mode and node, how long the graph stood still, and for each mode the episodes that were lost, came
-twice or ended otherwise than in a run that nobody disturbed. In real time, time passes while a module is dead; so the
-episodes have more of it here than a body's own, lest it be the clock that loses them.
+twice or ended otherwise than in a run that nobody disturbed. In real time some time passes until the clock waits for a
+module that is dead; so episodes have twice the ball's own here, lest it be the clock that loses them.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Options:
     modes: tuple[Mode, ...] = ("lockstep", "real time")
     speed: float = 2.0
     """Of real time."""
-    time_limit: int = 48_000
+    time_limit: int = 9_600
     """Steps of an episode."""
     oracle: tuple[str, ...] = ()
     """Roles that oracles play; none by default."""
