@@ -90,7 +90,12 @@ def attack(mode: str, options: Options) -> dict[str, Any]:
     command = [sys.executable, "bringup/run_stack.py", "--headless", "--episodes", "100000", *MODES[mode]]
     with tempfile.TemporaryFile("w+") as said:
         child = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said)
-        report = {"mode": mode, **_Attack(child, options).report()}
+        try:
+            report = {"mode": mode, **_Attack(child, options).report()}
+        finally:
+            child.send_signal(signal.SIGINT)
+            child.wait(60)
+        report["status"] = child.returncode
         said.seek(0)
         text = said.read()
     report["last_line"] = next(reversed(text.split("\n")[:-1]), "")
@@ -115,32 +120,31 @@ class _Attack:
         self._memory = list[int]()
 
     def report(self) -> dict[str, Any]:
-        """Flood topics, then services; end the run and return what became of it."""
+        """Flood topics, then services; return what became of the run."""
         child, vandal, caller = self._child, self._vandal, self._caller
         started = self._goes_on(START)
         processes = {member.pid for member in family(child.pid)}
         self._heard, self._since = vandal.heard, time.monotonic()
         self._measure()
-        while started and not {name for name, _ in _CALLS} <= set(caller.services):
-            caller.meet()
-            self._spin(0.1)
+        started = started and self._until(self._met, START)
         if started:
             self._flood_topics()
             self._flood_services()
         survived = started and self._goes_on(RECOVERY)
         silent = [name for name in caller.services if not self._answers(name)]
         lost = len(processes - {member.pid for member in family(child.pid)})
-        status = child.poll()
-        if status is None:
-            child.send_signal(signal.SIGINT)
-        child.wait(60)
+        crashed = child.poll() is not None
         rclpy.shutdown()
         return {
             "messages": sum(vandal.sent.values()), "calls": caller.sent.total(), "answered": caller.answered.total(),
             "services": len(caller.services), "silent_services": silent, "ticks": vandal.heard, "started": started,
-            "crashed": status is not None, "lost_processes": lost, "stalls": self._stalls, "hangs": self._hangs,
-            "goes_on": survived, "status": child.returncode, "megabytes": self._memory,
+            "crashed": crashed, "lost_processes": lost, "stalls": self._stalls, "hangs": self._hangs,
+            "goes_on": survived, "megabytes": self._memory,
         }  # fmt: skip
+
+    def _met(self) -> bool:
+        self._caller.meet()
+        return {name for name, _ in _CALLS} <= set(self._caller.services)
 
     def _flood_topics(self) -> None:
         burst = 10
@@ -160,9 +164,7 @@ class _Attack:
             self._caller.meet()
             self._caller.act(burst)
             called += burst
-            end = time.monotonic() + ANSWERED
-            while self._caller.pending and time.monotonic() < end:
-                self._spin(0.01)
+            self._until(lambda: not self._caller.pending, ANSWERED)
             self._caller.call(*_CALLS[-1])
             self._spin(0.05)
             self._watch()
@@ -186,19 +188,21 @@ class _Attack:
         while time.monotonic() < end:
             self._executor.spin_once(timeout_sec=0.01)
 
+    def _until(self, done: Callable[[], bool], seconds: float) -> bool:
+        """Spin until something is done, the time is over or the run has ended; return whether it was done."""
+        end = time.monotonic() + seconds
+        while not done() and time.monotonic() < end and self._child.poll() is None:
+            self._executor.spin_once(timeout_sec=0.01)
+        return done()
+
     def _goes_on(self, seconds: float) -> bool:
         """Wait for more ticks than the vandal may still have to hear of itself."""
-        enough, end = self._vandal.heard + DEPTH, time.monotonic() + seconds
-        while self._vandal.heard <= enough and time.monotonic() < end and self._child.poll() is None:
-            self._executor.spin_once(timeout_sec=0.01)
-        return self._vandal.heard > enough
+        enough = self._vandal.heard + DEPTH
+        return self._until(lambda: self._vandal.heard > enough, seconds)
 
     def _answers(self, service: str) -> bool:
         """Return whether a service answers a sound call."""
-        future, end = self._caller.call(service), time.monotonic() + ANSWERED
-        while not future.done() and time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.01)
-        return future.done()
+        return self._until(self._caller.call(service).done, ANSWERED)
 
 
 def damage(paths: list[Path], read: Callable[[], Any], count: int, rng: np.random.Generator) -> Counter[str]:
