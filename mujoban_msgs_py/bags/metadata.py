@@ -6,7 +6,9 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
+from textwrap import indent
 from typing import Any, Final
 
 import yaml
@@ -20,6 +22,7 @@ VERSION: Final = 9
 DISTRIBUTION: Final = "jazzy"
 
 _KEY: Final = "rosbag2_bagfile_information"
+_TOPICS: Final = "topics_with_message_count"
 _BAG: Final = "mujoban_bag"
 """Key of `Metadata.bag` in the custom data."""
 _DIGEST: Final = "sha256/"
@@ -95,7 +98,7 @@ class Metadata:
         information = self._information()
         if self.bag:
             information["custom_data"][_OWN_DIGEST] = _digest(information)
-        write_atomically(folder / FILE_NAME, _dump({_KEY: information}).encode())
+        write_atomically(folder / FILE_NAME, _dump_information(information).encode())
 
     @classmethod
     def read(cls, folder: Path) -> Metadata | None:
@@ -109,7 +112,7 @@ class Metadata:
             return None
         try:
             information = yaml.load(path.read_text(), _SafeLoader)[_KEY]
-            topics = [_topic(entry) for entry in information["topics_with_message_count"]]
+            topics = [_topic(entry) for entry in information[_TOPICS]]
             custom = information.get("custom_data") or {}
             stated = custom.pop(_OWN_DIGEST, None)
             if stated is not None and stated != _digest(information):
@@ -136,7 +139,7 @@ class Metadata:
             "duration": {"nanoseconds": end - start},
             "starting_time": {"nanoseconds_since_epoch": start},
             "message_count": sum(file.count for file in self.files),
-            "topics_with_message_count": [_topic_entry(topic) for topic in self.topics.values()],
+            _TOPICS: [_topic_entry(topic) for topic in self.topics.values()],
             "compression_format": "",
             "compression_mode": "",
             "relative_file_paths": [file.path for file in self.files],
@@ -167,13 +170,34 @@ def _dump(content: object) -> str:
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
 
 
+def _dump_information(information: Mapping[str, Any]) -> str:
+    """Return the file's text; a recorder has many bags of the same topics, of which only the counts differ."""
+    topics = "".join(_dump_entry(**entry) for entry in information[_TOPICS])
+    before, empty, after = _dump({_KEY: {**information, _TOPICS: []}}).partition(f"  {_TOPICS}: []\n")
+    return f"{before}  {_TOPICS}:\n{topics}{after}" if topics else f"{before}{empty}{after}"
+
+
+def _dump_entry(topic_metadata: Mapping[str, Any], message_count: int) -> str:
+    return f"{_dump_topic(json.dumps(topic_metadata))}    message_count: {message_count}\n"
+
+
+@lru_cache(maxsize=256)
+def _dump_topic(described: str) -> str:
+    return indent(_dump([{"topic_metadata": json.loads(described)}]), "  ")
+
+
 def _digest(information: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(information).encode()).hexdigest()
 
 
 def dump_qos(profiles: Sequence[Mapping[str, Any]]) -> str:
     """Return QoS profiles as the YAML text that MCAP channels carry."""
-    return yaml.dump([dict(p) for p in profiles], Dumper=_Dumper, sort_keys=False).strip()
+    return _dump_profiles(json.dumps([dict(p) for p in profiles]))
+
+
+@lru_cache(maxsize=256)
+def _dump_profiles(profiles: str) -> str:
+    return yaml.dump(json.loads(profiles), Dumper=_Dumper, sort_keys=False).strip()
 
 
 def load_qos(text: str | Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
