@@ -29,7 +29,7 @@ from mujoban_sim.appearance import (
     TARGET_COLOUR,
 )
 from mujoban_sim.presets import WorldPreset
-from mujoban_sim.render_scene import UNSEEN_GROUP, RenderScene, build_scene, write_level
+from mujoban_sim.render_scene import UNSEEN_GROUP, build_scene, write_level
 from mujoban_sim.scene import BOX_HALF_EXTENT
 from mujoban_sokoban.levels import Level
 
@@ -96,7 +96,9 @@ class _Painter:
         self._worker = Worker("painter")
         self.submit = self._worker.submit
         try:
-            self._scene: RenderScene = self.submit(self._open).result()
+            # One job each: whoever ends the process in the meantime waits for one of them only.
+            for part in (self._build, self._open, self._prepare):
+                self.submit(part).result()
         except BaseException:
             self._worker.end()
             raise
@@ -106,10 +108,14 @@ class _Painter:
         """Return nq, the number of generalised positions."""
         return self._scene.model.nq
 
-    def _open(self) -> RenderScene:
-        scene = build_scene(self._body, self._max_boxes, self._slots, self._size, self._preset)
-        model = scene.model
+    def _build(self) -> None:
+        self._scene = build_scene(self._body, self._max_boxes, self._slots, self._size, self._preset)
+
+    def _open(self) -> None:
         self._gl = open_context(self._size)
+
+    def _prepare(self) -> None:
+        model = self._scene.model
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
@@ -128,7 +134,6 @@ class _Painter:
             self._cameras[name], self._options[name] = camera, option
         self._viewport = mujoco.MjrRect(0, 0, self._size, self._size)
         self._filter_texture(model.texture("skyline").id)
-        return scene
 
     def _filter_texture(self, index: int) -> None:
         """Take texels from one mipmap level instead of blending two: a software renderer draws 15 % faster."""
