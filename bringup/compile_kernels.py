@@ -6,11 +6,15 @@ What has been compiled stays in the cache until its file changes.
 from __future__ import annotations
 
 import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 
 from bringup.command import Stack
 from bringup.evaluate import evaluate
+from bringup.exploration import Disturbance
+from bringup.record import Job, MixedEpisodes, record
 from mujoban_planner.lesson_source import LessonActor, LessonConfig
 from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.samples import Samples, make_batch
@@ -18,7 +22,7 @@ from mujoban_planner.search_lessons import SearchActor, SearchConfig
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Experience
 from mujoban_sokoban.episodes import Episodes
-from mujoban_sokoban.generator import VALIDATION_SEEDS
+from mujoban_sokoban.generator import TRAIN_SEEDS, VALIDATION_SEEDS
 
 _NETWORK = NetworkConfig(channels=4, blocks=1)
 
@@ -32,11 +36,19 @@ def _learn_from(experience: Experience, kind: str) -> None:
     environment.step(environment.possible().argmax(1))
 
 
+def _record(folder: Path) -> None:
+    """Record episodes that begin in the middle, one at a time: arrays of one row are of another type than of many."""
+    episodes = MixedEpisodes(4, TRAIN_SEEDS.start, (3,), advanced=1.0)
+    record(Job(folder, "", episodes, Stack(), Disturbance(wander=1.0), batch=1, time_limit=40, seed=0))
+
+
 def main() -> int:
-    """Play a little, and make and read the planner's lessons and search for some."""
+    """Play and record a little, and make and read the planner's lessons and search for some."""
     _learn_from(LessonActor(LessonConfig(levels=4), _NETWORK, 0).act(), "demonstrations")
     SearchActor(_NETWORK, SearchConfig(trees=8, expansions=8, steps=40), 0).act()
-    evaluate(Stack().policy(), Episodes(2, VALIDATION_SEEDS.start), time_limit=20)
+    evaluate(Stack().policy(), Episodes(2, VALIDATION_SEEDS.start), time_limit=60)
+    with tempfile.TemporaryDirectory() as folder:
+        _record(Path(folder))
     return 0
 
 
