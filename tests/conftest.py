@@ -11,6 +11,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("LP_NUM_THREADS", "0")
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from mujoban_msgs_py.runtime.discovery import PROFILES, RANGE, confine_discovery
 
@@ -18,6 +19,10 @@ from mujoban_msgs_py.runtime.discovery import PROFILES, RANGE, confine_discovery
 for name in (RANGE, PROFILES):
     os.environ.pop(name, None)
 confine_discovery()
+
+# How long a machine takes that has other work is no finding.
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 IMPORTABLE = str(Path(__file__).parent / "importable")
 """Where worker processes import from what tests let them do."""

@@ -19,7 +19,7 @@ def box_in_open_room() -> np.ndarray:
 
 
 @given(poses)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_floor_anchors_are_where_the_camera_sees_the_cells(pose):
     geometry = cell_geometry(np.array([pose]), BALL.camera, 1.0)
     cells = np.stack(np.divmod(np.arange(CELLS), GRID_SIZE), -1)
@@ -31,7 +31,7 @@ def test_floor_anchors_are_where_the_camera_sees_the_cells(pose):
 
 
 @given(poses)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_turning_the_world_does_not_change_what_is_relative_to_the_robot(pose):
     x, y, psi = pose
     here = cell_geometry(np.array([[x, y, psi]]), BALL.camera, 1.0)

@@ -20,7 +20,7 @@ def _boards(difficulty, seed, n):
     return generate_batch(difficulty, range(seed, seed + n))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(difficulty=st.integers(1, 5), seed=st.integers(0, 10_000), actions=st.integers(0, 2**32 - 1))
 def test_moves_and_pushes_are_those_of_the_bitboard(difficulty, seed, actions):
     env, rng = _environment(_boards(difficulty, seed, 16)), np.random.default_rng(actions)
@@ -36,7 +36,7 @@ def test_moves_and_pushes_are_those_of_the_bitboard(difficulty, seed, actions):
             assert after.box[i] == (bitboard.pushed(box, to, direction) if there & box else box)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(difficulty=st.integers(1, 5), seed=st.integers(0, 10_000), actions=st.integers(0, 2**32 - 1))
 def test_rules_and_rewards_are_those_of_the_simulator(difficulty, seed, actions):
     boards = _boards(difficulty, seed, 16)

@@ -337,7 +337,7 @@ def test_bad_arguments_are_named():
         room_world().place([0], [[np.nan, 0, 0]], np.zeros((1, 2, 2)))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**31), st.integers(1, 5))
 def test_walls_of_the_world_are_the_levels(seed, difficulty):
     level = generate_levels(difficulty, [seed])[0]

@@ -29,7 +29,7 @@ def digest() -> str:
 
 
 @given(difficulties, st.integers(0, TRAIN_SEEDS[-1]))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_a_level_has_the_size_and_boxes_of_its_difficulty(difficulty, seed):
     level = generate_level(difficulty, seed)
     size, boxes = DIFFICULTIES[difficulty]
@@ -42,7 +42,7 @@ def test_a_level_has_the_size_and_boxes_of_its_difficulty(difficulty, seed):
 
 
 @given(difficulties, st.integers(0, TRAIN_SEEDS[-1]))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_no_level_starts_with_a_target_taken(difficulty, seed):
     level = generate_level(difficulty, seed)
     assert not level.target[level.boxes[:, 0], level.boxes[:, 1]].any()

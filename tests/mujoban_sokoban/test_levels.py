@@ -57,7 +57,7 @@ def level_texts(draw):
 
 
 @given(level_texts())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_a_level_survives_the_round_trip_through_text(text):
     level = Level.from_text(text)
     again = Level.from_text(level.to_text())
@@ -66,7 +66,7 @@ def test_a_level_survives_the_round_trip_through_text(text):
 
 
 @given(level_texts())
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_text_and_abstract_state_show_the_same_things(text):
     state = Level.from_text(text).abstract_state()
     assert state.shape == (GRID_SIZE, GRID_SIZE, 4)

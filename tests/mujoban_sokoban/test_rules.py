@@ -19,7 +19,7 @@ levels = st.builds(generate_level, st.integers(1, 5), st.integers(0, 1000))
 
 
 @given(levels, instructions)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_play_keeps_the_invariants(level, plan):
     boxes, player, total = level.boxes, np.array(level.player), 0.0
     for instruction in plan:
@@ -47,7 +47,7 @@ def test_play_keeps_the_invariants(level, plan):
 
 
 @given(st.integers(0, 1000), st.randoms(use_true_random=False))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_batch_is_its_levels_one_by_one(seed, random):
     batch = generate_batch(4, range(seed, seed + 8))
     plan = np.array([random.randrange(5) for _ in range(8)])

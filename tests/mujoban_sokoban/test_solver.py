@@ -74,7 +74,7 @@ def small_levels(draw):
 
 
 @given(small_levels())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_solutions_are_as_short_as_breadth_first_search_and_unsolvable_means_so(level):
     expected = fewest_moves(level)
     solution = solve_level(level)
@@ -88,7 +88,7 @@ def test_solutions_are_as_short_as_breadth_first_search_and_unsolvable_means_so(
 
 
 @given(st.integers(1, 3), st.integers(0, 10_000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_generated_levels_are_solved_as_short_as_breadth_first_search(difficulty, seed):
     level = generate_level(difficulty, seed)
     solution = solve_level(level)
@@ -186,7 +186,7 @@ def test_demonstrations_lead_to_the_solution():
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_every_instruction_called_optimal_is(seed):
     batch = generate_batch(4, [seed])
     labels = label_states(batch)
