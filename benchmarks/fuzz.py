@@ -252,10 +252,11 @@ def files(options: Options) -> dict[str, dict[str, int]]:
 def measure(options: Options) -> dict[str, Any]:
     """Return what became of damaged files and of a graph under attack."""
     damaged = options.bags or options.weights or options.levels
-    return {
-        "options": asdict(options), "files": files(options) if damaged else {},
-        "runs": [attack(mode, options) for mode in options.modes],
-    }  # fmt: skip
+    report = {"options": asdict(options), "files": files(options) if damaged else {}, "runs": list[dict[str, Any]]()}
+    for mode in options.modes:
+        report["runs"].append(attack(mode, options))
+        print(f"{mode}: {report['runs'][-1]}", file=sys.stderr, flush=True)
+    return report
 
 
 if __name__ == "__main__":
