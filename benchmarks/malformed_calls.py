@@ -82,11 +82,6 @@ class Caller:
         """Those that were met."""
         return sorted(self._clients)
 
-    @property
-    def pending(self) -> int:
-        """Calls that wait for an answer."""
-        return sum(not future.done() for futures in self._pending.values() for future in futures)
-
     def meet(self) -> None:
         """Look for services that were not known yet, and ask nodes for the names of their parameters."""
         own = {name for name, _ in self._node.get_service_names_and_types_by_node(self._node.get_name(), "/")}
@@ -106,12 +101,13 @@ class Caller:
 
         return learn
 
-    def act(self, count: int = 1) -> None:
-        """Call each service so many times."""
+    def act(self, count: int = 1) -> list[Future]:
+        """Call each service so many times; return the answers to come."""
+        calls = []
         for name, kind in self._kinds.items():
             names = self._parameters.get(name.rpartition("/")[0], [])
-            for _ in range(count):
-                self.call(name, spoiled_request(kind, names, self._rng))
+            calls += [self.call(name, spoiled_request(kind, names, self._rng)) for _ in range(count)]
+        return calls
 
     def call(self, name: str, request: Any = None) -> Future:
         """Call a service, by default with the request that its type makes of nothing."""
