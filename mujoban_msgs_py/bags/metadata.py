@@ -197,7 +197,7 @@ def dump_qos(profiles: Sequence[Mapping[str, Any]]) -> str:
 
 @lru_cache(maxsize=256)
 def _dump_profiles(profiles: str) -> str:
-    return yaml.dump(json.loads(profiles), Dumper=_Dumper, sort_keys=False).strip()
+    return _dump(json.loads(profiles)).strip()
 
 
 def load_qos(text: str | Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
