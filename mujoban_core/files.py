@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 _DEVICES = (Path("/dev"), Path("/proc"))
+
+
+_UNFINISHED = ".unfinished"
 
 
 @contextmanager
@@ -19,11 +23,32 @@ def replacing(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        _put(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_alone(path: Path) -> Iterator[Path]:
+    """Give a place as `replacing` does, of a folder that only one process writes to.
+
+    What a process that was killed had begun to write there is removed first: large files would fill the disk.
+    """
+    path = path.resolve()
+    folder = path.parent / _UNFINISHED
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    try:
+        yield folder / path.name
+        _put(folder / path.name, path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _put(temporary: Path, path: Path) -> None:
+    with temporary.open("rb") as file:
+        os.fsync(file.fileno())
+    temporary.replace(path)
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from mujoban_core.files import digest, naming, replacing, write_atomically
+from mujoban_core.files import digest, naming, replacing_alone, write_atomically
 from mujoban_rl.weights import check_finite
 
 _ANOTHER = "choose another directory"
@@ -115,7 +115,7 @@ class RunDirectory:
         json.dumps(content, allow_nan=False)  # before anything is written
         path = self.path / f"checkpoint-{step:010d}.safetensors"
         # Into a file and not into memory: a replay may take up most of that.
-        with naming(path), replacing(path) as temporary:
+        with naming(path), replacing_alone(path) as temporary:
             _save(flat, temporary)
             content["digest"] = digest(temporary)
         try:

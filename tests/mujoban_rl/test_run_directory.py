@@ -1,6 +1,9 @@
 import errno
 import json
 import math
+import signal
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -63,6 +66,28 @@ def test_a_checkpoint_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path
     assert sorted(file.name for file in tmp_path.iterdir()) == before
     snapshot = run.load(modules={"net": net}, optimisers={"adam": adam})
     assert snapshot is not None and snapshot.step == 1
+
+
+_KILLED = """
+import os, signal, sys, torch
+from mujoban_rl import run_directory
+
+def kill(tensors, path):
+    path.with_name(".tmpAbC").write_bytes(b"half")  # as the library does, which renames it at the end
+    os.kill(os.getpid(), signal.SIGKILL)
+
+run_directory.save_file = kill
+run_directory.RunDirectory(sys.argv[1], {}).save(1, modules={"net": torch.nn.Linear(2, 2)})
+"""
+
+
+def test_what_a_killed_process_had_written_of_a_checkpoint_does_not_stay_on_the_disk(tmp_path):
+    killed = subprocess.run([sys.executable, "-c", _KILLED, str(tmp_path)], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert list(tmp_path.rglob(".tmp*"))
+    RunDirectory(tmp_path, {}).save(2, modules={"net": nn.Linear(2, 2)})
+    names = ["checkpoint-0000000002.json", "checkpoint-0000000002.safetensors", "config.json"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == names
 
 
 def test_moments_come_back_in_the_layout_of_their_parameters_which_fused_optimisers_rely_on(tmp_path):
