@@ -243,7 +243,7 @@ def working(jobs: Sequence[Job]) -> Iterator[list[Connection]]:
         for job in jobs:
             ours, theirs = context.Pipe(duplex=False)
             process = context.Process(target=_work, args=(job, theirs), daemon=True)
-            with children.sheltered():
+            with children.sheltered(), children.large_pages():
                 process.start()
             theirs.close()
             processes.append(process)
