@@ -132,7 +132,8 @@ def test_the_view_from_above_is_drawn_as_often_as_its_readers_need(play_graph, r
     topic = topics.TOP_CAMERA
     node.create_subscription(topic.type, topic.name, lambda m: stamps.append(conversions.stamp_of(m)), qos)
     graph.spin_until(lambda: len(stamps) > 12)
-    assert set(np.diff(stamps[4:])) == {period * topics.TICK}
+    shown = list(dict.fromkeys(stamps[4:]))  # a tick that stays without an answer is published again
+    assert set(np.diff(shown)) == {period * topics.TICK}
 
 
 def test_the_view_from_above_has_as_many_pixels_to_a_metre_with_every_body():
