@@ -132,7 +132,9 @@ def test_the_view_from_above_is_drawn_as_often_as_its_readers_need(play_graph, r
     topic = topics.TOP_CAMERA
     node.create_subscription(topic.type, topic.name, lambda m: stamps.append(conversions.stamp_of(m)), qos)
     graph.spin_until(lambda: len(stamps) > 12)
-    shown = list(dict.fromkeys(stamps[4:]))  # a tick that stays without an answer is published again
+    shown = list(dict.fromkeys(stamps[4:]))
+    # On a busy machine a tick stays without an answer and is published again; else each is once.
+    assert len(stamps[4:]) - len(shown) <= graph.simulator.counts["repeated ticks"]
     assert set(np.diff(shown)) == {period * topics.TICK}
 
 
