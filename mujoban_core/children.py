@@ -54,17 +54,17 @@ def sheltered() -> Iterator[None]:
 def large_pages() -> Iterator[None]:
     """Have programs that are started within keep what they allocate in pages of 2 MiB, where the kernel allows it.
 
-    It has fewer pages to give back then when a process with much memory ends, which is most of what that takes.
+    It has fewer pages to take back then when a process with much memory ends.
     Settings of the C library that the environment has already stay as they are.
     """
-    before = os.environ.get(_C_LIBRARY)
-    if before is None:
-        os.environ[_C_LIBRARY] = "glibc.malloc.hugetlb=1"
+    if _C_LIBRARY in os.environ:
+        yield
+        return
+    os.environ[_C_LIBRARY] = "glibc.malloc.hugetlb=1"
     try:
         yield
     finally:
-        if before is None:
-            os.environ.pop(_C_LIBRARY, None)
+        del os.environ[_C_LIBRARY]
 
 
 def end_with_parent() -> None:
