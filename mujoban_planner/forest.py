@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from mujoban_planner.boards import BitBoards, signed
-from mujoban_planner.forest_kernels import Trees, expand, judge, plant, pop
+from mujoban_planner.forest_kernels import Trees, expand, judge, plant, pop, question
 from mujoban_rl.engine import State
 
 _BRANCHING: Final = 12
@@ -71,6 +71,8 @@ class Forest:
             waiting=np.zeros(trees, np.int64),
             solution=np.full(trees, -1, np.int64),
             expansions=np.zeros(trees, np.int64),
+            settled=np.zeros(shape, np.bool_),
+            branch=np.zeros(shape, np.int32),
         )
 
     @property
@@ -115,6 +117,15 @@ class Forest:
         """
         expand(self.trees, rows, nodes, push, alive, self.limit)
 
+    def question(self, rows: NDArray[np.int64]) -> None:
+        """Let R trees that are solved, [R], search on: does each push beside the way leave a solution too?
+
+        The search starts anew from every state on the way, that is, a push costs what it costs from there. A push is
+        judged when the search from it comes to the solution or to what is known to lead there, or to its end. While
+        nodes wait in the tree, `pop` and `expand` go on.
+        """
+        question(self.trees, rows)
+
     def solution(self, row: int) -> NDArray[np.uint8]:
         """Return the pushes of a solution, 4 * square + direction, [its length]; nothing where none was found."""
         way = self.way(row)
@@ -144,7 +155,6 @@ class Forest:
         verdicts = Verdicts(node, solvable, lost, known, dead, searched)
         judge(trees, row, *verdicts)
         return verdicts
-
 
     def state(self) -> State:
         """Return all trees."""

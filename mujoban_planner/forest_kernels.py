@@ -33,6 +33,8 @@ DEAD_WEIGHT: Final = 1.0
 """Weight of log p(alive) in a node's cost."""
 _DEAD: Final = -2
 """In place of a child: the push leads nowhere at sight. -1 stands for a state that no node was made for."""
+_HOME: Final = -3
+"""In place of a child: the push solves the level."""
 
 
 class Trees(NamedTuple):
@@ -75,6 +77,10 @@ class Trees(NamedTuple):
     """Node in which the level is solved, -1 while there is none, [M]."""
     expansions: NDArray[np.int64]
     """Nodes that were expanded, [M]."""
+    settled: NDArray[np.bool_]
+    """Whether a node that `question` looks at is known to leave a solution, [M, N]."""
+    branch: NDArray[np.int32]
+    """Where the way from the first node to this one leaves what is settled, [M, N]."""
 
 
 @njit(cache=True, nogil=True)
@@ -206,6 +212,7 @@ def expand(
         free = ~wall & ~box
         start = np.int64(trees.agent[row, node])
         reached = flood(bit(start), free)
+        asked = trees.solution[row] >= 0
         options, largest = 0, -np.inf
         for direction in range(4):
             ready = pushable(reached, free, box, direction)
@@ -231,6 +238,9 @@ def expand(
             region = region_of(wall, after, square)
             slot = _find(trees, row, after, region)
             seen = trees.table[row, slot]
+            if asked and (after == target or (seen >= 0 and trees.settled[row, seen])):
+                _settle(trees, row, node)
+                break
             if seen >= 0 and trees.moves[row, seen] <= moves:
                 continue
             child = _add(trees, row, slot, after, square, region)
@@ -240,10 +250,62 @@ def expand(
             trees.parent[row, child], trees.push[row, child] = node, 4 * square + direction
             if after == target:
                 trees.solution[row] = child
-                break
-            trees.cost[row, child] = np.log(depth + 1.0) - logp - DEAD_WEIGHT * alive[i]
+                continue
+            base = 0
+            if asked:
+                trees.settled[row, child], trees.branch[row, child] = False, trees.branch[row, node]
+                base = trees.parent[row, trees.branch[row, node]]
+            trees.cost[row, child] = _cost(trees, row, child, base) - DEAD_WEIGHT * alive[i]
             _sift_up(trees.heap[row], trees.cost[row], trees.waiting[row], child)
             trees.waiting[row] += 1
+        if asked:
+            _forget_settled(trees, row)
+
+
+@njit(cache=True, nogil=True)
+def _cost(trees: Trees, row: Int, node: Int, base: Int) -> float:
+    """Return the cost of a node in a search from node `base`, before the verdict on it counts."""
+    depth, logp = trees.depth[row], trees.logp[row]
+    return np.log(depth[node] - depth[base] + 1.0) - (logp[node] - logp[base])
+
+
+@njit(cache=True, nogil=True)
+def _settle(trees: Trees, row: Int, node: Int) -> None:
+    """Note that a solution is left from a node, and so from all before it."""
+    while node >= 0 and not trees.settled[row, node]:
+        trees.settled[row, node] = True
+        node = np.int64(trees.parent[row, node])
+
+
+@njit(cache=True, nogil=True)
+def _forget_settled(trees: Trees, row: Int) -> None:
+    """Take the cheapest nodes out of a tree as long as the push that they are to judge is judged."""
+    while trees.waiting[row] and trees.settled[row, trees.branch[row, trees.heap[row, 0]]]:
+        _take_first(trees.heap[row], trees.cost[row], trees.waiting[row])
+        trees.waiting[row] -= 1
+
+
+@njit(cache=True, nogil=True)
+def question(trees: Trees, rows: NDArray[np.int64]) -> None:
+    """Let R solved trees search on from every push beside the way; see `forest.Forest.question`."""
+    for i in range(len(rows)):
+        row = np.int64(rows[i])
+        nodes = trees.nodes[row]
+        trees.settled[row, :nodes] = False
+        for node in range(nodes):
+            if trees.box[row, node] == trees.target[row]:
+                _settle(trees, row, node)
+        trees.waiting[row] = 0
+        for node in range(1, nodes):
+            if trees.settled[row, node]:
+                continue
+            above = trees.parent[row, node]
+            branch = node if trees.settled[row, above] else trees.branch[row, above]
+            trees.branch[row, node] = branch
+            if not trees.expanded[row, node]:
+                trees.cost[row, node] = _cost(trees, row, node, trees.parent[row, branch])
+                _sift_up(trees.heap[row], trees.cost[row], trees.waiting[row], node)
+                trees.waiting[row] += 1
 
 
 @njit(cache=True, nogil=True)
@@ -277,8 +339,8 @@ def judge(
                 square = lowest(ready)
                 ready &= ready - ONE
                 after = pushed(box, square, direction)
-                child = _DEAD
-                if not hopeless(after, wall, target, trees.dead[row]):
+                child = _HOME if after == target else _DEAD
+                if child == _DEAD and not hopeless(after, wall, target, trees.dead[row]):
                     region = region_of(wall, after, square)
                     child = np.int64(trees.table[row, _find(trees, row, after, region)])
                 source[edges], direction_of[edges] = x, direction
@@ -295,12 +357,12 @@ def judge(
                 continue
             if not is_live[state] and (child < 0 or is_live[child]):
                 is_live[state] = changed = True
-            if child >= 0 and solves[child] and not solves[state]:
+            if not solves[state] and (child == _HOME or (child >= 0 and solves[child])):
                 solves[state] = changed = True
     for e in range(edges):
         x, child = source[e], child_of[e]
         deadly = child == _DEAD or (child >= 0 and not is_live[child])
-        if deadly or (child >= 0 and solves[child]):
+        if deadly or child == _HOME or (child >= 0 and solves[child]):
             known[x, direction_of[e]] |= bit(square_of[e])
         if deadly:
             dead[x, direction_of[e]] |= bit(square_of[e])

@@ -4,7 +4,7 @@ Levin search, guided by the planner, solves what the planner alone does not; the
 found, and so guides the next searches better. Many searches run at once, each of a step per network evaluation; one
 that ends makes room for the next level, and a level that was not solved comes again with twice the budget. Two things
 are learned from a search: the way that it found, in every state along it, and which pushes it proved deadly or safe
-(`forest.Forest.judge`). Nobody but the rules says what is right.
+(`forest.Forest.judge`), for which it goes on a while when it has found its way. Nobody but the rules says what is right.
 
 Shapes: M trees, R rows, S samples.
 """
@@ -50,6 +50,8 @@ class SearchConfig:
     """Searches at once."""
     expansions: int = 60
     """Network evaluations of a search; doubled each time that a level comes again."""
+    questions: int = 40
+    """Network evaluations after a solution was found, to judge the pushes beside its way."""
     retries: int = 2
     """How often a level that was not solved comes again."""
     retried: float = 0.15
@@ -103,7 +105,9 @@ class SearchActor(Actor):
         self.planner, self.config = network.build().eval(), config
         self.planner.lay_out()
         self._levels = TrainingLevels(stream, retried=config.retried, retries=config.retries)
-        self._forest = Forest(config.trees, config.expansions << config.retries, MOVE_LIMIT)
+        self._forest = Forest(config.trees, (config.expansions << config.retries) + config.questions, MOVE_LIMIT)
+        self._budgets = np.zeros(config.trees, np.int64)
+        self._questioned = np.zeros(config.trees, np.bool_)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
         self._leads = [_Lead(0) for _ in range(config.trees)]
         self._rng = np.random.default_rng([stream, 4])
@@ -127,14 +131,16 @@ class SearchActor(Actor):
         """Return levels, trees and random state."""
         leads = [[lead.pushes_left, [list(state) for state in lead.states]] for lead in self._leads]
         tickets = [list(ticket) for ticket in self._tickets]
-        own = State({"rng": self._rng.bit_generator.state, "tickets": tickets, "leads": leads})
+        arrays = {"budgets": torch.from_numpy(self._budgets), "questioned": torch.from_numpy(self._questioned)}
+        own = State({"rng": self._rng.bit_generator.state, "tickets": tickets, "leads": leads}, arrays)
         return State.of({"own": own, "levels": self._levels.state(), "forest": self._forest.state()})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         self._levels.restore(state.part("levels"))
         self._forest.restore(state.part("forest"))
-        own = state.part("own").values
+        own, arrays = state.part("own").values, state.part("own").tensors
+        self._budgets[:], self._questioned[:] = arrays["budgets"].numpy(), arrays["questioned"].numpy()
         self._rng.bit_generator.state = own["rng"]
         self._tickets = [Ticket(*ticket) for ticket in own["tickets"]]
         self._leads = [_Lead(left, [(x, y, z) for x, y, z in states]) for left, states in own["leads"]]
@@ -142,7 +148,9 @@ class SearchActor(Actor):
     def _advance(self, lessons: dict[str, list[Samples]], ended: dict[str, list[bool]]) -> None:
         """Let every search take a step; learn from those that have ended, and start others in their place."""
         forest, config = self._forest, self.config
-        over = np.flatnonzero(~forest.open | (forest.expansions >= self._budgets()))
+        self._question()
+        going = forest.open | (self._questioned & (forest.trees.waiting > 0))
+        over = np.flatnonzero(~going | (forest.expansions >= self._budgets))
         if over.size:
             planted = over[forest.trees.nodes[over] > 0]  # none is at first
             for row in planted.tolist():
@@ -157,20 +165,22 @@ class SearchActor(Actor):
             led = (self._rng.random(len(over)) < config.led) * self._rng.integers(1, config.lead + 1, len(over))
             for row, ticket, pushes in zip(over.tolist(), tickets, led.tolist(), strict=True):
                 self._tickets[row], self._leads[row] = ticket, _Lead(0 if ticket.failures else pushes)
+                # Those after own play have most to prove.
+                doublings = config.retries if self._leads[row].pushes_left else ticket.failures
+                self._budgets[row] = config.expansions << doublings
+            self._questioned[over] = False
         with autocast("cpu"):
             grow(forest, np.arange(config.trees), self.planner)
         for row, lead in enumerate(self._leads):
             if lead.pushes_left:
                 self._play(row, lead)
 
-    def _budgets(self) -> NDArray[np.int64]:
-        """Return the expansions that each search may take, [M]; those after own play have most to prove."""
-        config = self.config
-        doublings = [
-            config.retries if lead.states else ticket.failures
-            for ticket, lead in zip(self._tickets, self._leads, strict=True)
-        ]
-        return config.expansions << np.array(doublings, np.int64)
+    def _question(self) -> None:
+        """Let searches that have just found a solution go on to judge the pushes beside its way."""
+        solved = np.flatnonzero((self._forest.trees.solution >= 0) & ~self._questioned)
+        self._forest.question(solved)
+        self._questioned[solved] = True
+        self._budgets[solved] = self._forest.expansions[solved] + self.config.questions
 
     def _play(self, row: int, lead: _Lead) -> None:
         """Push once by chance, as the planner's probabilities are, in a tree whose first node was just expanded."""

@@ -15,7 +15,7 @@ from mujoban_planner.training_levels import TrainingLevels
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Cadence
 from mujoban_rl.testing import check_refusal, check_resuming
-from mujoban_sokoban.bitboard import SQUARE_STEP
+from mujoban_sokoban.bitboard import SQUARE_STEP, bit, flood, pushable
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 from mujoban_sokoban.levels import Level, stack_levels
 from mujoban_sokoban.solver import Status, solve_batch
@@ -41,6 +41,13 @@ def judged_pushes(samples: Samples):
     return state, push // 64, push % 64, bits[1][state, push].astype(bool)
 
 
+def pushes_possible(wall, target, box, agent):
+    """Return the boxes that can be pushed now in each direction, as boards, [4]."""
+    free = ~(wall | box)
+    reached = flood(bit(agent), free)
+    return [pushable(reached, free, box, direction) for direction in range(4)]
+
+
 def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
     for samples, both in ((lessons["way"], True), (lessons["verdict"], False)):
         state, direction, square, deadly = judged_pushes(samples)
@@ -51,6 +58,40 @@ def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
         status = solve_batch(level_batch(boards)).status
         assert (status == np.where(deadly, Status.UNSOLVABLE, Status.SOLVED)).all()
         assert deadly.sum() > 30 and (not both or (~deadly).sum() > 30)
+
+
+def test_a_solved_search_goes_on_to_judge_the_pushes_beside_its_way():
+    torch.manual_seed(0)
+    forest = Forest(32, 400, 120)
+    forest.plant(np.arange(32), bit_boards(generate_batch(3, range(TRAIN_SEEDS.start, TRAIN_SEEDS.start + 32))))
+    planner = ResidualPlanner(8, 1, judge=True).eval()
+    while (rows := np.flatnonzero(forest.open & (forest.expansions < 200))).size:
+        grow(forest, rows, planner)
+    solved = np.flatnonzero(forest.trees.solution > 0)
+    assert len(solved) > 8
+
+    def judged(row):
+        """Return the pushes from states on the way that are judged, [length of the way, 4]."""
+        verdicts = forest.judge(row)
+        return verdicts.known[np.isin(verdicts.node, forest.way(row))]
+
+    before, ways = [judged(row) for row in solved], [forest.way(row).tolist() for row in solved]
+    forest.question(solved)
+    for _ in range(150):
+        if (rows := solved[forest.trees.waiting[solved] > 0]).size:
+            grow(forest, rows, planner)
+    after = [judged(row) for row in solved]
+    assert all((x & ~y == 0).all() for x, y in zip(before, after, strict=True)), "nothing is forgotten"
+    assert [forest.way(row).tolist() for row in solved] == ways, "the solution stays what it was"
+    done = [i for i, row in enumerate(solved) if forest.trees.waiting[row] == 0]
+    assert len(done) > len(solved) // 4
+    missing = 0
+    for i in done:
+        boards = forest.boards(solved[i], np.sort(forest.way(solved[i])))
+        possible = np.array([pushes_possible(*board) for board in zip(*boards, strict=True)], np.uint64)
+        assert (after[i] == possible).all(), "where nothing waits, all is judged"
+        missing += int(np.bitwise_count(possible & ~before[i]).sum())
+    assert missing > 20
 
 
 def test_ways_lead_to_the_solution_in_the_moves_that_their_values_count(lessons):
