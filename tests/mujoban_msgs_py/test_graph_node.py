@@ -64,6 +64,8 @@ def test_a_parameter_of_no_type_is_refused_by_name_and_what_came_before_it_is_se
     assert node.counts["rejected messages"] == 1
     assert f"rejected a message on /steadfast/{name}: 77 is not a valid Parameter.Type" in capfd.readouterr().err
     executor.shutdown()
+    for each in (node, other):
+        each.destroy_node()  # or later tests would discover it
 
 
 def test_timers_go_on_by_wall_time_though_there_is_no_simulated_time(ros):
