@@ -4,7 +4,7 @@ Levin search, guided by the planner, solves what the planner alone does not; the
 found, and so guides the next searches better. Many searches run at once, each of a step per network evaluation; one
 that ends makes room for the next level, and a level that was not solved comes again with twice the budget. Two things
 are learned from a search: the way that it found, in every state along it, and which pushes it proved deadly or safe
-(`forest.Forest.judge`), for which it goes on a while when it has found its way. Nobody but the rules says what is right.
+(`forest.Forest.judge`), for which it goes on when it has found its way. Nobody but the rules says what is right.
 
 Shapes: M trees, R rows, S samples.
 """
