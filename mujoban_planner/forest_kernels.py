@@ -243,6 +243,8 @@ def expand(
                 break
             if seen >= 0 and trees.moves[row, seen] <= moves:
                 continue
+            if after == target and trees.solution[row] >= 0:
+                continue  # the first solution stands
             child = _add(trees, row, slot, after, square, region)
             logp = trees.logp[row, node] + push[i, direction, square] - largest - np.log(total)
             depth = trees.depth[row, node] + 1
@@ -292,9 +294,7 @@ def question(trees: Trees, rows: NDArray[np.int64]) -> None:
         row = np.int64(rows[i])
         nodes = trees.nodes[row]
         trees.settled[row, :nodes] = False
-        for node in range(nodes):
-            if trees.box[row, node] == trees.target[row]:
-                _settle(trees, row, node)
+        _settle(trees, row, trees.solution[row])
         trees.waiting[row] = 0
         for node in range(1, nodes):
             if trees.settled[row, node]:
@@ -346,8 +346,6 @@ def judge(
                 source[edges], direction_of[edges] = x, direction
                 square_of[edges], child_of[edges] = square, child
                 edges += 1
-    if trees.solution[row] >= 0:
-        solves[trees.solution[row]] = True
     changed = True
     while changed:
         changed = False

@@ -107,7 +107,6 @@ class SearchActor(Actor):
         self._levels = TrainingLevels(stream, retried=config.retried, retries=config.retries)
         self._forest = Forest(config.trees, (config.expansions << config.retries) + config.questions, MOVE_LIMIT)
         self._budgets = np.zeros(config.trees, np.int64)
-        self._questioned = np.zeros(config.trees, np.bool_)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
         self._leads = [_Lead(0) for _ in range(config.trees)]
         self._rng = np.random.default_rng([stream, 4])
@@ -131,16 +130,16 @@ class SearchActor(Actor):
         """Return levels, trees and random state."""
         leads = [[lead.pushes_left, [list(state) for state in lead.states]] for lead in self._leads]
         tickets = [list(ticket) for ticket in self._tickets]
-        arrays = {"budgets": torch.from_numpy(self._budgets), "questioned": torch.from_numpy(self._questioned)}
-        own = State({"rng": self._rng.bit_generator.state, "tickets": tickets, "leads": leads}, arrays)
+        values = {"rng": self._rng.bit_generator.state, "tickets": tickets, "leads": leads}
+        own = State(values, {"budgets": torch.from_numpy(self._budgets)})
         return State.of({"own": own, "levels": self._levels.state(), "forest": self._forest.state()})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         self._levels.restore(state.part("levels"))
         self._forest.restore(state.part("forest"))
-        own, arrays = state.part("own").values, state.part("own").tensors
-        self._budgets[:], self._questioned[:] = arrays["budgets"].numpy(), arrays["questioned"].numpy()
+        self._budgets[:] = state.part("own").tensors["budgets"].numpy()
+        own = state.part("own").values
         self._rng.bit_generator.state = own["rng"]
         self._tickets = [Ticket(*ticket) for ticket in own["tickets"]]
         self._leads = [_Lead(left, [(x, y, z) for x, y, z in states]) for left, states in own["leads"]]
@@ -148,9 +147,7 @@ class SearchActor(Actor):
     def _advance(self, lessons: dict[str, list[Samples]], ended: dict[str, list[bool]]) -> None:
         """Let every search take a step; learn from those that have ended, and start others in their place."""
         forest, config = self._forest, self.config
-        self._question()
-        going = forest.open | (self._questioned & (forest.trees.waiting > 0))
-        over = np.flatnonzero(~going | (forest.expansions >= self._budgets))
+        over = np.flatnonzero((forest.trees.waiting == 0) | (forest.expansions >= self._budgets))
         if over.size:
             planted = over[forest.trees.nodes[over] > 0]  # none is at first
             for row in planted.tolist():
@@ -168,19 +165,20 @@ class SearchActor(Actor):
                 # Those after own play have most to prove.
                 doublings = config.retries if self._leads[row].pushes_left else ticket.failures
                 self._budgets[row] = config.expansions << doublings
-            self._questioned[over] = False
-        with autocast("cpu"):
-            grow(forest, np.arange(config.trees), self.planner)
+        self._grow()
         for row, lead in enumerate(self._leads):
             if lead.pushes_left:
                 self._play(row, lead)
 
-    def _question(self) -> None:
-        """Let searches that have just found a solution go on to judge the pushes beside its way."""
-        solved = np.flatnonzero((self._forest.trees.solution >= 0) & ~self._questioned)
-        self._forest.question(solved)
-        self._questioned[solved] = True
-        self._budgets[solved] = self._forest.expansions[solved] + self.config.questions
+    def _grow(self) -> None:
+        """Expand a node of every tree; a search that finds its way goes on to judge the pushes beside it."""
+        forest = self._forest
+        searching = forest.trees.solution < 0
+        with autocast("cpu"):
+            grow(forest, np.arange(self.config.trees), self.planner)
+        solved = np.flatnonzero(searching & (forest.trees.solution >= 0))
+        forest.question(solved)
+        self._budgets[solved] = forest.expansions[solved] + self.config.questions
 
     def _play(self, row: int, lead: _Lead) -> None:
         """Push once by chance, as the planner's probabilities are, in a tree whose first node was just expanded."""

@@ -11,11 +11,12 @@ from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.samples import Samples
 from mujoban_planner.search import grow
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
+from mujoban_planner.teacher import reachable_pushes
 from mujoban_planner.training_levels import TrainingLevels
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Cadence
 from mujoban_rl.testing import check_refusal, check_resuming
-from mujoban_sokoban.bitboard import SQUARE_STEP, bit, flood, pushable
+from mujoban_sokoban.bitboard import SQUARE_STEP
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 from mujoban_sokoban.levels import Level, stack_levels
 from mujoban_sokoban.solver import Status, solve_batch
@@ -39,13 +40,6 @@ def judged_pushes(samples: Samples):
     bits = [np.unpackbits(np.ascontiguousarray(x).view(np.uint8), axis=1, bitorder="little") for x in samples[-2:]]
     state, push = np.nonzero(bits[0])
     return state, push // 64, push % 64, bits[1][state, push].astype(bool)
-
-
-def pushes_possible(wall, target, box, agent):
-    """Return the boxes that can be pushed now in each direction, as boards, [4]."""
-    free = ~(wall | box)
-    reached = flood(bit(agent), free)
-    return [pushable(reached, free, box, direction) for direction in range(4)]
 
 
 def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
@@ -87,8 +81,7 @@ def test_a_solved_search_goes_on_to_judge_the_pushes_beside_its_way():
     assert len(done) > len(solved) // 4
     missing = 0
     for i in done:
-        boards = forest.boards(solved[i], np.sort(forest.way(solved[i])))
-        possible = np.array([pushes_possible(*board) for board in zip(*boards, strict=True)], np.uint64)
+        possible = reachable_pushes(forest.boards(solved[i], np.sort(forest.way(solved[i]))))
         assert (after[i] == possible).all(), "where nothing waits, all is judged"
         missing += int(np.bitwise_count(possible & ~before[i]).sum())
     assert missing > 20
