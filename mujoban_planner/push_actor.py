@@ -86,7 +86,7 @@ class PushActor(Actor):
             over = np.flatnonzero(step.over)
             for row in over.tolist():
                 ticket, solved = self._tickets[row], bool(step.solved[row])
-                self._levels.report(ticket, solved)
+                self._levels.rate(ticket, solved)
                 statistics[f"solved/{ticket.difficulty}"].append(solved)
             self._reset(over)
         arrays = {name: np.stack(values) for name, values in seen.items()}

@@ -2,28 +2,30 @@
 
 Levin search, guided by the planner, solves what the planner alone does not; the planner learns from what the search
 found, and so guides the next searches better. Many searches run at once, each of a step per network evaluation; one
-that ends makes room for the next level, and a level that was not solved comes again with twice the budget. Two things
-are learned from a search: the way that it found, in every state along it, and which pushes it proved deadly or safe
-(`forest.Forest.judge`), for which it goes on when it has found its way. Nobody but the rules says what is right.
+that ends makes room for the next level. The planner plays that by itself first, and only what it loses is searched,
+from the start or from somewhere on the way to its loss; a level that was not solved comes again with twice the budget.
+Two things are learned from a search: the way that it found, in every state along it, and which pushes it proved deadly
+or safe (`forest.Forest.judge`), for which it goes on when it has found its way. Of these states those are kept in which
+the planner errs, and some others. Nobody but the rules says what is right.
 
-Shapes: M trees, R rows, S samples.
+Shapes: M trees, S samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import BitBoards, level_batch
 from mujoban_planner.forest import Forest, Verdicts
+from mujoban_planner.lessons import errs
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch, unlabelled
 from mujoban_planner.search import grow
 from mujoban_planner.symmetry import SYMMETRIES
@@ -61,13 +63,15 @@ class SearchConfig:
     walks: float = 0.25
     """Share that is kept of the states between two pushes."""
     led: float = 0.5
-    """Share of searches that start from where the planner's own play leads; the others start from a level's start."""
-    lead: int = 16
-    """Pushes of such play at most."""
+    """Share of searches that start from within the planner's own play of a level; the others start from its start."""
+    lead: int = 40
+    """Pushes of such play at most; where it wins, nothing is searched."""
     verdicts: int = 6
     """States off the way, of each search, whose proven verdicts are kept."""
     judged: float = 0.4
     """Share of a batch that holds such states."""
+    easy: float = 0.25
+    """Share that is kept of the states in which the planner errs nowhere."""
     buffer: int = 200_000
     """Samples kept of each kind."""
     batch_size: int = 256
@@ -81,10 +85,12 @@ class SearchConfig:
 class _Lead:
     """The planner's own play before a search."""
 
-    pushes_left: int
-    """Pushes before the search begins."""
+    playing: bool
+    """Whether the search has still to begin."""
+    won: bool = False
+    """Whether there is nothing to search."""
     states: list[tuple[int, int, int]] = field(default_factory=list)
-    """Boxes, square of the robot, and push (4 * square + direction) so far."""
+    """Boxes, square of the robot, and push (4 * square + direction); in the end, of what came before the search."""
 
 
 class SearchActor(Actor):
@@ -108,7 +114,7 @@ class SearchActor(Actor):
         self._forest = Forest(config.trees, (config.expansions << config.retries) + config.questions, MOVE_LIMIT)
         self._budgets = np.zeros(config.trees, np.int64)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
-        self._leads = [_Lead(0) for _ in range(config.trees)]
+        self._leads = [_Lead(playing=False) for _ in range(config.trees)]
         self._rng = np.random.default_rng([stream, 4])
 
     def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
@@ -118,17 +124,18 @@ class SearchActor(Actor):
     def act(self) -> Experience:
         """Let every search take so many steps."""
         lessons: dict[str, list[Samples]] = {"way": [unlabelled(_NO_BOARDS)], "verdict": [unlabelled(_NO_BOARDS)]}
-        ended: dict[str, list[bool]] = {f"search/{d}": [] for d in DIFFICULTIES}
+        ended: dict[str, list[bool]] = {f"{kind}/{d}": [] for kind in ("play", "search") for d in DIFFICULTIES}
         for _ in range(self.config.steps):
             self._advance(lessons, ended)
-        arrays = {f"{k}.{n}": column for k, v in lessons.items() for n, column in concatenate(v)._asdict().items()}
+        kept = {kind: self._prioritise(concatenate(parts)) for kind, parts in lessons.items()}
+        arrays = {f"{kind}.{n}": column for kind, samples in kept.items() for n, column in samples._asdict().items()}
         arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         statistics = {name: np.array(solved, np.float32) for name, solved in ended.items()}
         return Experience(arrays, self.config.trees * self.config.steps, statistics)
 
     def state(self) -> State:
         """Return levels, trees and random state."""
-        leads = [[lead.pushes_left, [list(state) for state in lead.states]] for lead in self._leads]
+        leads = [[lead.playing, lead.won, [list(state) for state in lead.states]] for lead in self._leads]
         tickets = [list(ticket) for ticket in self._tickets]
         values = {"rng": self._rng.bit_generator.state, "tickets": tickets, "leads": leads}
         own = State(values, {"budgets": torch.from_numpy(self._budgets)})
@@ -142,33 +149,37 @@ class SearchActor(Actor):
         own = state.part("own").values
         self._rng.bit_generator.state = own["rng"]
         self._tickets = [Ticket(*ticket) for ticket in own["tickets"]]
-        self._leads = [_Lead(left, [(x, y, z) for x, y, z in states]) for left, states in own["leads"]]
+        self._leads = [_Lead(playing, won, [(x, y, z) for x, y, z in way]) for playing, won, way in own["leads"]]
 
     def _advance(self, lessons: dict[str, list[Samples]], ended: dict[str, list[bool]]) -> None:
         """Let every search take a step; learn from those that have ended, and start others in their place."""
         forest, config = self._forest, self.config
         over = np.flatnonzero((forest.trees.waiting == 0) | (forest.expansions >= self._budgets))
         if over.size:
-            planted = over[forest.trees.nodes[over] > 0]  # none is at first
-            for row in planted.tolist():
+            searched = [row for row in over.tolist() if forest.trees.nodes[row] and not self._leads[row].won]
+            for row in searched:
                 ticket, solved = self._tickets[row], bool(forest.trees.solution[row] >= 0)
                 if not self._leads[row].states:
-                    self._levels.report(ticket, solved)
+                    if not solved:
+                        self._levels.come_again(ticket)
                     if ticket.failures == 0:
                         ended[f"search/{ticket.difficulty}"].append(solved)
-            self._learn(planted, lessons)
+            self._learn(searched, lessons)
             boards, tickets = self._levels.draw(len(over))
             forest.plant(over, boards)
-            led = (self._rng.random(len(over)) < config.led) * self._rng.integers(1, config.lead + 1, len(over))
-            for row, ticket, pushes in zip(over.tolist(), tickets, led.tolist(), strict=True):
-                self._tickets[row], self._leads[row] = ticket, _Lead(0 if ticket.failures else pushes)
-                # Those after own play have most to prove.
-                doublings = config.retries if self._leads[row].pushes_left else ticket.failures
-                self._budgets[row] = config.expansions << doublings
+            for row, ticket in zip(over.tolist(), tickets, strict=True):
+                self._tickets[row], self._leads[row] = ticket, _Lead(playing=ticket.failures == 0)
+                self._budgets[row] = config.expansions << ticket.failures
         self._grow()
         for row, lead in enumerate(self._leads):
-            if lead.pushes_left:
-                self._play(row, lead)
+            if lead.playing:
+                self._play(row, lead, ended)
+
+    def _prioritise(self, samples: Samples) -> Samples:
+        """Return the samples on which the planner errs, and a share of the others."""
+        kept = self._rng.random(len(samples.agent)) < self.config.easy
+        kept[~kept] = errs(self.planner, samples.take(np.flatnonzero(~kept)))
+        return samples.take(kept)
 
     def _grow(self) -> None:
         """Expand a node of every tree; a search that finds its way goes on to judge the pushes beside it."""
@@ -180,23 +191,41 @@ class SearchActor(Actor):
         forest.question(solved)
         self._budgets[solved] = forest.expansions[solved] + self.config.questions
 
-    def _play(self, row: int, lead: _Lead) -> None:
+    def _play(self, row: int, lead: _Lead, ended: dict[str, list[bool]]) -> None:
         """Push once by chance, as the planner's probabilities are, in a tree whose first node was just expanded."""
-        trees = self._forest.trees
+        trees, ticket = self._forest.trees, self._tickets[row]
         children = np.arange(1, trees.nodes[row])
-        if trees.solution[row] >= 0 or not children.size:
-            lead.pushes_left = 0
+        lead.won = bool(trees.solution[row] >= 0)
+        if lead.won or not children.size or len(lead.states) == self.config.lead:
+            lead.playing = False
+            self._levels.rate(ticket, lead.won)
+            ended[f"play/{ticket.difficulty}"].append(lead.won)
+            if lead.won:
+                self._budgets[row] = 0
+            else:
+                self._go_back(row, lead)
             return
         chances = np.exp(trees.logp[row, children].astype(np.float64))
         child = int(self._rng.choice(children, p=chances / chances.sum()))
         lead.states.append((int(trees.box[row, 0]), int(trees.agent[row, 0]), int(trees.push[row, child])))
-        lead.pushes_left -= 1
         self._forest.plant(np.array([row]), self._forest.boards(row, np.array([child])))
 
-    def _learn(self, rows: NDArray[np.int64], lessons: dict[str, list[Samples]]) -> None:
-        """Add what the searches in trees `rows`, [R], found and proved."""
+    def _go_back(self, row: int, lead: _Lead) -> None:
+        """Begin the search of a level that own play has lost: at its start, or somewhere on the way that it took."""
+        trees, way = self._forest.trees, len(lead.states)
+        kept = int(self._rng.integers(1, way)) if way > 1 and self._rng.random() < self.config.led else 0
+        if way:
+            box, agent, _ = lead.states[kept]
+            columns = trees.wall[[row]], trees.target[[row]], np.array([box], np.uint64), np.array([agent], np.uint8)
+            self._forest.plant(np.array([row]), BitBoards(*columns))
+        lead.states = lead.states[:kept]
+        if kept:  # there is most to prove
+            self._budgets[row] = self.config.expansions << self.config.retries
+
+    def _learn(self, rows: Sequence[int], lessons: dict[str, list[Samples]]) -> None:
+        """Add what the searches in these trees found and proved."""
         forest, config = self._forest, self.config
-        verdicts = {row: forest.judge(row) for row in rows.tolist()}
+        verdicts = {row: forest.judge(row) for row in rows}
         solved = {row: proved for row, proved in verdicts.items() if len(forest.way(row))}
         if solved:
             ways = label_ways(forest, solved, self._rng)

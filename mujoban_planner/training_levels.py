@@ -97,13 +97,15 @@ class TrainingLevels:
                 self._next += 1
         return _boards(tickets), tickets
 
-    def report(self, ticket: Ticket, solved: bool) -> None:
-        """Take note of how a level ended."""
-        if ticket.failures == 0:
-            i = list(DIFFICULTIES).index(ticket.difficulty)
-            self._solved[i] = _MEMORY * self._solved[i] + solved
-            self._tried[i] = _MEMORY * self._tried[i] + 1.0
-        if not solved and ticket.failures < self._retries and len(self._failed) < _KEPT_FAILURES:
+    def rate(self, ticket: Ticket, solved: bool) -> None:
+        """Take note of how a level ended at the first try."""
+        i = list(DIFFICULTIES).index(ticket.difficulty)
+        self._solved[i] = _MEMORY * self._solved[i] + solved
+        self._tried[i] = _MEMORY * self._tried[i] + 1.0
+
+    def come_again(self, ticket: Ticket) -> None:
+        """Draw a level that was tried in vain again, unless that was its last time."""
+        if ticket.failures < self._retries and len(self._failed) < _KEPT_FAILURES:
             self._failed.append(ticket._replace(failures=ticket.failures + 1))
 
     def state(self) -> State:

@@ -1,14 +1,18 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_planner import load
 from mujoban_planner.boards import BitBoards, bit_boards, level_batch
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.forest import Forest
+from mujoban_planner.lessons import errs
 from mujoban_planner.networks import ResidualPlanner
-from mujoban_planner.samples import Samples
+from mujoban_planner.samples import Samples, concatenate
 from mujoban_planner.search import grow
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
 from mujoban_planner.teacher import reachable_pushes
@@ -22,6 +26,7 @@ from mujoban_sokoban.levels import Level, stack_levels
 from mujoban_sokoban.solver import Status, solve_batch
 
 NETWORK = NetworkConfig(channels=8, blocks=1)
+KINDS = ("way", "verdict")
 SMALL = SearchConfig(trees=16, expansions=20, buffer=4000, steps=16, batch_size=32, noise=0.1, hidden=0.2)
 
 
@@ -30,7 +35,7 @@ def lessons():
     torch.set_num_threads(1)
     torch.manual_seed(0)
     actor, store = SearchActor(NETWORK, SMALL, 0), LessonStore(SMALL, 0)
-    for _ in range(8):
+    for _ in range(16):
         store.add(actor.act())
     return {kind: buffer.storage.take(np.arange(min(buffer.size, 400))) for kind, buffer in store.buffers.items()}
 
@@ -52,6 +57,32 @@ def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
         status = solve_batch(level_batch(boards)).status
         assert (status == np.where(deadly, Status.UNSOLVABLE, Status.SOLVED)).all()
         assert deadly.sum() > 30 and (not both or (~deadly).sum() > 30)
+
+
+def test_what_own_play_wins_is_not_searched():
+    torch.manual_seed(0)
+    actor = SearchActor(NETWORK, SMALL, 0)
+    statistics = [actor.act().statistics for _ in range(12)]
+    played, searched = (
+        np.concatenate([found[f"{kind}/{d}"] for found in statistics for d in DIFFICULTIES])
+        for kind in ("play", "search")
+    )
+    won, lost = int(played.sum()), int((1 - played).sum())
+    assert won > 5 and 5 < len(searched) <= lost
+
+
+def test_of_the_lessons_those_are_kept_in_which_the_planner_errs():
+    erred = {}
+    for easy in (0.0, 1.0):
+        actor = SearchActor(NETWORK, replace(SMALL, trees=64, easy=easy), 0)
+        actor.planner = load(compiled=False)
+        lessons = [actor.act().arrays for _ in range(5)]
+        samples = concatenate(
+            [Samples._make(x[f"{kind}.{name}"] for name in Samples._fields) for x in lessons for kind in KINDS]
+        )
+        erred[easy] = errs(actor.planner, samples)
+    assert erred[0.0].sum() > 0 and (~erred[0.0]).sum() < 3, "but for rounding, all"
+    assert (~erred[1.0]).sum() > 10
 
 
 def test_a_solved_search_goes_on_to_judge_the_pushes_beside_its_way():
@@ -116,16 +147,16 @@ def test_levels_that_were_not_solved_come_again_and_the_mix_follows_what_is_solv
     levels = TrainingLevels(0, retried=1.0, retries=1)
     _, tickets = levels.draw(64)
     assert all(ticket.seed in TRAIN_SEEDS for ticket in tickets)
-    levels.report(tickets[0], solved=False)
+    levels.come_again(tickets[0])
     boards, again = levels.draw(1)
     assert again == [tickets[0]._replace(failures=1)]
     expected = bit_boards(generate_batch(tickets[0].difficulty, [tickets[0].seed]))
     assert all((x == y).all() for x, y in zip(boards, expected, strict=True))
-    levels.report(again[0], solved=False)
+    levels.come_again(again[0])
     assert levels.draw(1)[1][0].failures == 0
     for _ in range(300):
         for ticket in levels.draw(4)[1]:
-            levels.report(ticket, solved=True)
+            levels.rate(ticket, solved=True)
     assert levels.shares[-1] > 0.8
     with pytest.raises(ValueError, match="stream -1"):
         TrainingLevels(-1)
