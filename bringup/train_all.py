@@ -47,6 +47,8 @@ PRODUCTS: Final = {
 }
 """And all that another stage needs: the teacher, its student, the planner of boards in full view, the bags."""
 _BAGS: Final = ("first", "second")
+_CRITIC: Final = "teacher/critic.safetensors"
+"""The teacher's, with which MPO of its student begins."""
 SHARES: Final = {
     "teacher": 0.09,
     "controller_distil": 0.27,
@@ -122,13 +124,27 @@ def _from_before(options: Options, option: str, product: str) -> tuple[str, ...]
     return () if options.before is None else (option, str(options.before / PRODUCTS[product]))
 
 
-def _trainer(options: Options, name: str, command: Sequence[str], product: str, *needs: str, cores: int = 1) -> Stage:
-    """Return a stage that trains for its share of the hours, which no limit of steps cuts short."""
+def _trainer(
+    options: Options, name: str, command: Sequence[str], product: str, *needs: str, cores: int = 1,
+    beside: Sequence[str] = (),
+) -> Stage:  # fmt: skip
+    """Return a stage that trains for its share of the hours, which no limit of steps cuts short.
+
+    Args:
+        options: Of the whole run.
+        name: Of the stage.
+        command: Module and arguments.
+        product: Its weights, a path in the run's directory.
+        needs: Stages before it.
+        cores: How many it keeps busy.
+        beside: What it makes beside its product.
+    """
     seconds = _seconds(options, name)
     budget = ("--cpu-seconds", str(round(_SAVED * seconds * cores)))
     folder = options.run / name
     arguments = ("-m", *command, "--run", str(folder), *budget)
-    return Stage(name, arguments, (options.run / product,), needs, seconds, cores)
+    outputs = tuple(options.run / path for path in (product, *beside))
+    return Stage(name, arguments, outputs, needs, seconds, cores)
 
 
 def _controller(options: Options) -> list[Stage]:
@@ -140,15 +156,16 @@ def _controller(options: Options) -> list[Stage]:
     return [
         _trainer(
             options, "teacher", (train, "--stage", "teacher", "--algorithm", "mpo", *common,
-            *_from_before(options, "--initial", "teacher")), teacher,
+            *_from_before(options, "--initial", "teacher")), teacher, beside=(_CRITIC,),
         ),
         _trainer(
             options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common,
             *_from_before(options, "--initial", "controller")), student, "teacher",
         ),
         _trainer(
-            options, "controller_mpo", (train, "--stage", "mpo", "--initial", str(run / student), *common),
-            WEIGHTS["controller"], "controller_distil",
+            options, "controller_mpo",
+            (train, "--stage", "mpo", "--initial", str(run / student), "--critic", str(run / _CRITIC), *common),
+            WEIGHTS["controller"], "teacher", "controller_distil",
         ),
     ]  # fmt: skip
 

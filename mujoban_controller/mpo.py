@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +30,8 @@ from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss, check_samples, 
 from mujoban_rl.losses.returns import td_target
 from mujoban_rl.networks import Gaussian
 from mujoban_rl.optimise import guarded_step, moving_average
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.weights import save_weights
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,8 @@ class MPOLearner(ProductLearner[Batch]):
             config: Settings.
             generator: Draws the actions of the E-step.
             validation: On what the policy is judged.
-            critic: Its critic, if it sees more than the privileged features of the goal task.
+            critic: Its critic, if it is not to begin untaught, or sees more than the privileged features of the goal
+                task.
         """
         super().__init__(validation or Validation())
         self.policy, self.config, self._generator = policy, config, generator
@@ -216,6 +219,11 @@ class MPOLearner(ProductLearner[Batch]):
             if not beside:
                 self.target_critic.load_state_dict(self.critic.state_dict())
         return stats
+
+    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
+        """Write the best product, and the critic as it is, with which MPO of another policy may begin."""
+        super().export(directory, record)
+        save_weights(directory.path / "critic.safetensors", self.critic, self.critic.config, record)
 
     def _update_critic(self, beside: Batch, guard: NaNGuard) -> tuple[dict[str, float], bool]:
         """Take the critic's own steps, from windows [K, M, W, ...]; return whether none was refused."""

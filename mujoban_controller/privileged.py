@@ -109,6 +109,7 @@ class Critic(nn.Module):
         """Build the network for a body; `extra` features stand behind the privileged ones."""
         super().__init__()
         layout = feature_layout(get_body(body))
+        self.config = {"body": body, "width": width, "extra": extra}
         self.normaliser = Normaliser(layout.size + extra)
         self.state = nn.Linear(layout.size + extra, width)
         self.action = nn.Linear(layout.actuators.shape[1], width, bias=False)

@@ -2,8 +2,8 @@
 
 1. `teacher`: a privileged policy learns the goal task from its rewards alone, by MPO or PPO (`--algorithm`).
 2. `distil --teacher WEIGHTS`: it is distilled into the camera policy, on the states that this one visits.
-3. `mpo --initial WEIGHTS`: the camera policy learns on by MPO with an asymmetric critic (paper C.3); without initial
-   weights from scratch.
+3. `mpo --initial WEIGHTS`: the camera policy learns on by MPO with an asymmetric critic (paper C.3), that of its
+   teacher by `--critic WEIGHTS`; without initial weights from scratch.
 
 With `--bags`, recorded bags of the running stack join the replay of `distil` and `mpo`; with `--bag-share 1` nothing
 else does: such a run learns offline and drives no simulator.
@@ -35,15 +35,16 @@ from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.mpo import AsymmetricConfig, MPOLearner, MPOTrainingConfig
 from mujoban_controller.play import Draw, ExploringPlayer, Player, PrivilegedPlayer, ReplaySource
+from mujoban_controller.policy import GoalPolicy
 from mujoban_controller.ppo import PPOLearner, PPOTrainingConfig, RolloutSource
-from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_controller.privileged import Critic, PrivilegedPolicy
 from mujoban_controller.product import Validation
 from mujoban_core.program import read_options, run_command
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.networks import set_scale
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import load_weights, origin, provenance
+from mujoban_rl.weights import WeightsError, load_weights, origin, provenance
 from mujoban_sim.oracles import OraclePlanner
 
 PROG = "mujoban_controller.train"
@@ -77,6 +78,8 @@ class TrainConfig:
     """Weights to start from."""
     teacher: Path | None = None
     """Weights of the privileged teacher that the stage distil needs."""
+    critic: Path | None = None
+    """Weights of the critic that MPO begins with, which MPO of a teacher leaves beside the teacher's."""
     task: GoalTaskConfig = field(default_factory=GoalTaskConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ppo: PPOTrainingConfig = field(default_factory=PPOTrainingConfig)
@@ -97,6 +100,8 @@ class TrainConfig:
             raise ValueError(f"--teacher {self.teacher}: only the stage distil has a teacher, not {self.stage}")
         if self.teacher is None and self.stage == "distil":
             raise ValueError("--stage distil: expected --teacher, weights of a run of the stage teacher")
+        if self.critic is not None and (self.stage == "distil" or (self.stage, self.algorithm) == ("teacher", "ppo")):
+            raise ValueError(f"--critic {self.critic}: only MPO has such a critic, not --stage {self.stage}")
 
 
 @dataclass(frozen=True)
@@ -162,19 +167,26 @@ class _Parts:
 
     def _mpo(self) -> tuple[Learner[Any], Source[Any]]:
         config, policy = self.config, self._privileged(0.6)
-        learner = MPOLearner(policy, config.task.body, config.mpo, self.generator(), self.validation)
+        learner = self._learner(policy, config.mpo)
         return learner, self._replay(PrivilegedPlayer(self.task, policy, self.generator()), config.mpo)
 
     def _asymmetric(self) -> tuple[Learner[Any], Source[Any]]:
         config, policy = self.config, self._camera()
         if config.asymmetric.initial_scale:
             set_scale(policy.scale, config.asymmetric.initial_scale)
-        learner = MPOLearner(policy, config.task.body, config.asymmetric, self.generator(), self.validation)
+        learner = self._learner(policy, config.asymmetric)
 
         def player() -> Player:
             return ExploringPlayer(self.task, policy, self.generator(), config.asymmetric.explore)
 
         return learner, self._replay_with_bags(player, policy, config.asymmetric)
+
+    def _learner(self, policy: GoalPolicy, settings: MPOTrainingConfig) -> MPOLearner:
+        path, body = self.config.critic, self.config.task.body
+        critic = None if path is None else load_weights(Critic, path).train()
+        if critic is not None and critic.config != Critic(body).config:
+            raise WeightsError(f"{path}: a critic of {critic.config}, expected one of {Critic(body).config}")
+        return MPOLearner(policy, body, settings, self.generator(), self.validation, critic)
 
     def _distil(self) -> tuple[Learner[Any], Source[Any]]:
         config, student = self.config, self._camera()
@@ -255,6 +267,7 @@ def make_trainer(options: Options) -> Trainer[Any]:
         "training": directory.config,
         "teacher": origin(config.teacher),
         "initial": origin(config.initial),
+        "critic": origin(config.critic),
         "data": f"generated levels of difficulty {config.task.difficulty}, seeds of TRAIN_SEEDS",
         "world": config.task.world,
         "bags": [bag.name for bag in options.bags],

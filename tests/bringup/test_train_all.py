@@ -30,7 +30,7 @@ def finished(folder: Path) -> Path:
 
 def test_a_run_begins_from_nothing(tmp_path: Path) -> None:
     for name, command in commands(Options(run=tmp_path)).items():
-        begun = {option for option in ("--initial", "--init", "--start") if option in command}
+        begun = {option for option in ("--initial", "--init", "--start", "--critic") if option in command}
         # What a later stage begins with was made by an earlier one of the same run.
         assert all(command[command.index(option) + 1].startswith(str(tmp_path)) for option in begun), name
         assert "--initial" not in begun or name == "controller_mpo"

@@ -18,14 +18,14 @@ from mujoban_controller.episodes import TrainingEpisodes
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.mpo import AsymmetricConfig, MPOTrainingConfig
 from mujoban_controller.ppo import PPOTrainingConfig
-from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_controller.privileged import Critic, PrivilegedPolicy
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, make_trainer
 from mujoban_core.grid import Instruction
 from mujoban_rl.engine import Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.run_directory import RunDirectory, RunError
 from mujoban_rl.testing import check_refusal, check_resuming
-from mujoban_rl.weights import load_weights, save_weights
+from mujoban_rl.weights import WeightsError, load_weights, save_weights
 from mujoban_sim.goals import GoalKind
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
@@ -87,6 +87,20 @@ def test_the_product_of_a_run_has_a_record_and_loads(make, tmp_path):
     assert record["samples"] == trainer.progress.samples and record["training"]["seed"] == 0
     product = load_weights(type(trainer.learner.product), file)
     assert all(torch.equal(v, product.state_dict()[k]) for k, v in trainer.learner.product.state_dict().items())
+
+
+def test_mpo_of_a_student_begins_with_the_critic_of_its_teacher(tmp_path):
+    make_trainer(Options(tmp_path / "teacher", replace(STAGES["mpo"], steps=96), evaluation_episodes=0)).run()
+    file = tmp_path / "teacher" / "critic.safetensors"
+    config = replace(STAGES["critic beside"], critic=file)
+    learner = make_trainer(Options(tmp_path / "student", config, evaluation_episodes=0)).learner
+    taught = load_weights(Critic, file).state_dict()
+    for critic in (learner.critic, learner.target_critic):
+        assert all(torch.equal(v, taught[k]) for k, v in critic.state_dict().items())
+    other = Critic("ant")
+    save_weights(tmp_path / "ant.safetensors", other, other.config, {})
+    with pytest.raises(WeightsError, match=r"ant\.safetensors: a critic of .*ant.*, expected one of .*ball"):
+        make_trainer(Options(tmp_path / "ant", replace(config, critic=tmp_path / "ant.safetensors")))
 
 
 def test_the_best_product_on_validation_levels_is_exported(teacher, tmp_path):
@@ -178,3 +192,5 @@ def test_stages_say_what_weights_they_need():
         TrainConfig(stage="mpo", teacher=Path("teacher.safetensors"))
     with pytest.raises(ValueError, match="expected --teacher"):
         TrainConfig(stage="distil")
+    with pytest.raises(ValueError, match="only MPO has such a critic, not --stage teacher"):
+        TrainConfig(stage="teacher", algorithm="ppo", critic=Path("critic.safetensors"))
