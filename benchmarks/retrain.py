@@ -40,7 +40,7 @@ class Options:
     """Steps of the schedule of the retraining."""
     seconds: float = 480.0
     """Longest time of the retraining."""
-    threads: int = 2
+    threads: int = 1
     levels: int = 48
     """Levels on which both pairs are judged."""
 

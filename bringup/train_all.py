@@ -1,10 +1,11 @@
 """Make the weights of all four modules from nothing: `python -m bringup.train_all --hours 8 --run runs/all`.
 
-Bottom-up, as in the paper (section 2, Training): the controller (a teacher by reward, its camera policy by distillation
-and MPO); beside it the planner; bags of both with perfect sense; estimator and termination from these bags; bags of
-all four, and estimator and termination again from both. No weight that ships is read. Stop it at any time: the same
-command goes on. At the end stand `weights/` and `report.md` in the run's directory. With `--continue` another run takes
-up all modules where a finished one has left them.
+Bottom-up, as in the paper (section 2, Training): the controller (a teacher by reward, its camera policy by
+distillation) beside the planner; bags of both with perfect sense; estimator and termination from these bags, beside MPO
+of the controller and the planner's lessons in partial views; bags of all four, and estimator and termination again from
+both. No weight that ships is read. Stop it at any time: the same command goes on. At the end stand `weights/` and
+`report.md` in the run's directory. With `--continue` another run takes up all modules where a finished one has left
+them.
 """
 
 from __future__ import annotations
@@ -51,17 +52,19 @@ _CRITIC: Final = "teacher/critic.safetensors"
 """The teacher's, with which MPO of its student begins."""
 SHARES: Final = {
     "teacher": 0.09,
-    "controller_distil": 0.27,
-    "controller_mpo": 0.10,
+    "controller_distil": 0.31,
     "planner": 0.40,
-    "planner_views": 0.06,
-    "bags_first": 0.03,
-    "estimator_first": 0.16,
+    "bags_first": 0.05,
+    "estimator_first": 0.21,
+    "controller_mpo": 0.10,
+    "planner_views": 0.12,
     "bags_second": 0.03,
-    "estimator_second": 0.19,
+    "estimator_second": 0.21,
     "evaluation": 0.08,
 }
-"""Share of the hours that each stage gets. Controller and planner train side by side, on one core each."""
+"""Share of the hours that each stage gets, in their order. Every training has a core: teacher and student beside the
+planner, then the second steps of controller and planner beside the first of the senses. More threads than one bring the
+senses nothing, and cost six times as much where they must share a core."""
 _STEPS: Final = 10**12
 """More than any budget of time lets a trainer take."""
 _SAVED: Final = 0.92
@@ -112,7 +115,9 @@ class Options:
 
 def stages(options: Options) -> list[Stage]:
     """Return all stages of a run, each after what it needs."""
-    return [*_controller(options), *_planner(options), *_senses(options), _evaluation(options)]
+    found = [*_controller(options), *_planner(options), *_senses(options), _evaluation(options)]
+    order = list(SHARES)
+    return sorted(found, key=lambda stage: order.index(stage.name))
 
 
 def _seconds(options: Options, name: str) -> float:
@@ -125,9 +130,8 @@ def _from_before(options: Options, option: str, product: str) -> tuple[str, ...]
 
 
 def _trainer(
-    options: Options, name: str, command: Sequence[str], product: str, *needs: str, cores: int = 1,
-    beside: Sequence[str] = (),
-) -> Stage:  # fmt: skip
+    options: Options, name: str, command: Sequence[str], product: str, *needs: str, beside: Sequence[str] = ()
+) -> Stage:
     """Return a stage that trains for its share of the hours, which no limit of steps cuts short.
 
     Args:
@@ -136,15 +140,14 @@ def _trainer(
         command: Module and arguments.
         product: Its weights, a path in the run's directory.
         needs: Stages before it.
-        cores: How many it keeps busy.
         beside: What it makes beside its product.
     """
     seconds = _seconds(options, name)
-    budget = ("--cpu-seconds", str(round(_SAVED * seconds * cores)))
+    budget = ("--cpu-seconds", str(round(_SAVED * seconds)))
     folder = options.run / name
     arguments = ("-m", *command, "--run", str(folder), *budget)
     outputs = tuple(options.run / path for path in (product, *beside))
-    return Stage(name, arguments, outputs, needs, seconds, cores)
+    return Stage(name, arguments, outputs, needs, seconds)
 
 
 def _controller(options: Options) -> list[Stage]:
@@ -186,39 +189,42 @@ def _senses(options: Options) -> list[Stage]:
     earlier = [] if options.before is None else [options.before / PRODUCTS[name] for name in _BAGS]
     bags = [str(folder) for folder in earlier if folder.exists()]
     start = None if options.before is None else (options.before / PRODUCTS["estimator"]).parent
-    acting = ("controller_mpo", "planner_views")
-    for round_, sense in (("first", ("--oracle", "estimator,termination")), ("second", _modules(options, "first"))):
+    for round_ in _BAGS:
         recording = f"bags_{round_}"
-        needs = acting if round_ == "first" else (*acting, "estimator_first")
-        found.append(_recording(options, recording, sense, needs))
+        found.append(_recording(options, recording))
         bags.append(str(options.run / recording))
         name = f"estimator_{round_}"
         out = options.run / name / "weights"
-        command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out), "--threads", str(options.cores)]
+        command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out)]
         command += ["--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
         if start is not None:
             command += ["--start", str(start)]
         start = out
-        found.append(_trainer(options, name, command, f"{name}/weights", recording, cores=options.cores))
+        found.append(_trainer(options, name, command, f"{name}/weights", recording))
     return found
 
 
-def _modules(options: Options, round_: str) -> tuple[str, ...]:
-    folder = options.run / f"estimator_{round_}" / "weights"
-    return tuple(x for role in ("estimator", "termination") for x in (f"--{role}", str(folder / f"{role}.safetensors")))
-
-
-def _recording(options: Options, name: str, sense: tuple[str, ...], needs: tuple[str, ...]) -> Stage:
-    run = options.run
+def _recording(options: Options, name: str) -> Stage:
+    """Return a stage that records bags: the first of what has learned until then, with perfect sense, then of all."""
+    run, first = options.run, name == "bags_first"
+    # Controller and planner are not ready at the same time, and what is begun then on one core is not to wait for two.
+    cores = 1 if first else options.cores
+    if first:
+        needs = {"controller": "controller_distil", "planner": "planner"}
+        acting = {"controller": PRODUCTS["student"], "planner": PRODUCTS["whole"]}
+    else:
+        needs = {"controller": "controller_mpo", "planner": "planner_views", "senses": "estimator_first"}
+        acting = {role: WEIGHTS[role].replace("estimator_second", "estimator_first") for role in WEIGHTS}
+    sense = ("--oracle", "estimator,termination") if first else ()
+    modules = tuple(x for role, path in acting.items() for x in (f"--{role}", str(run / path)))
     episodes = max(8, round(_EPISODES_PER_HOUR * options.hours))
-    acting = tuple(x for role in ("controller", "planner") for x in (f"--{role}", str(run / WEIGHTS[role])))
     seed = TRAIN_SEEDS.start + (len(_STREAMS) * options.seed + _STREAMS[name]) * 10**9
     command = (
         "-m", "bringup.record", "--out", str(run / name), "--episodes", str(episodes),
         "--seed", str(seed), "--time-limit", str(_RECORDED_STEPS),
-        "--processes", str(options.cores), "--world", options.world, *sense, *acting,
+        "--processes", str(cores), "--world", options.world, *sense, *modules,
     )  # fmt: skip
-    return Stage(name, command, (run / name,), needs, _seconds(options, name), options.cores, resumes=False)
+    return Stage(name, command, (run / name,), tuple(needs.values()), _seconds(options, name), cores, resumes=False)
 
 
 def _evaluation(options: Options) -> Stage:

@@ -36,6 +36,22 @@ def test_a_run_begins_from_nothing(tmp_path: Path) -> None:
         assert "--initial" not in begun or name == "controller_mpo"
 
 
+def test_a_stage_reads_only_what_the_stages_that_it_needs_have_made(tmp_path: Path) -> None:
+    found = {stage.name: stage for stage in stages(Options(run=tmp_path))}
+
+    def made(name: str) -> set[str]:
+        return {str(p) for p in found[name].products}.union(*(made(need) for need in found[name].needs))
+
+    read = 0
+    for stage in found.values():
+        before = set[str]().union(*(made(need) for need in stage.needs))
+        own = {str(tmp_path / stage.name), *map(str, stage.products)}
+        named = [x for x in stage.command if x.startswith(str(tmp_path)) and x not in own]
+        assert all(any(x == y or x.startswith(f"{y}/") for y in before) for x in named), (stage.name, named)
+        read += len(named)
+    assert read > 15
+
+
 def test_a_continued_run_takes_every_module_from_the_one_before(tmp_path: Path) -> None:
     before = finished(tmp_path / "before")
     found = commands(Options(run=tmp_path / "run", before=before))
