@@ -254,9 +254,11 @@ class LessonStore:
         for kind, buffer in self.buffers.items():
             buffer.add(Samples._make(experience.arrays[f"{kind}.{name}"] for name in Samples._fields))
 
-    def sample(self) -> Batch:
-        """Return a batch."""
+    def sample(self) -> Batch | None:
+        """Return a batch, once so many states of ways are there: a good planner wins its first levels by itself."""
         ways, verdicts, size = self.buffers["way"], self.buffers["verdict"], self.config.batch_size
+        if ways.size < size:
+            return None
         judged = int(size * self.config.judged) if verdicts.size > size else 0
         parts = [ways.draw(size - judged, self._rng)]
         if judged:

@@ -26,8 +26,8 @@ class ExperienceStore(Protocol[_BatchT_co]):
     def add(self, experience: Experience) -> None:
         """Take in what an actor delivered; its arrays may be read-only, and are not kept alive by anybody else."""
 
-    def sample(self) -> _BatchT_co:
-        """Return a batch to learn from."""
+    def sample(self) -> _BatchT_co | None:
+        """Return a batch to learn from, or None as long as there is too little for one."""
         ...
 
     def state(self) -> State:
@@ -71,16 +71,16 @@ class ActorSource(Source[BatchT], Generic[BatchT]):
         self._since = time.monotonic(), 0  # when statistics were asked for last, steps since then
 
     def next_batch(self) -> BatchT:
-        """Return a batch, once the steps that are due for it have come in.
+        """Return a batch, once the steps that are due for it have come in, and what they taught is enough for one.
 
         Raises:
             ActorError: If an actor raised an error, or dies again and again.
         """
         due = self._first + self._ratio * (self._updates + 1)
-        while self.samples < due:
+        while self.samples < due or (batch := self.store.sample()) is None:
             self._add(self.pool.collect())
         self._updates += 1
-        return self.store.sample()
+        return batch
 
     def _add(self, experience: Experience) -> None:
         self.store.add(experience)

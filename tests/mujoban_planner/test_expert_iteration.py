@@ -18,6 +18,7 @@ from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfi
 from mujoban_planner.teacher import reachable_pushes
 from mujoban_planner.training_levels import TrainingLevels
 from mujoban_planner.validation import NetworkConfig
+from mujoban_rl.actors import Experience
 from mujoban_rl.engine import Cadence
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_sokoban.bitboard import SQUARE_STEP
@@ -69,6 +70,17 @@ def test_what_own_play_wins_is_not_searched():
     )
     won, lost = int(played.sum()), int((1 - played).sum())
     assert won > 5 and 5 < len(searched) <= lost
+
+
+def test_learning_waits_until_searches_have_taught_enough(lessons):
+    store, batch = LessonStore(SMALL, 0), SMALL.batch_size
+    rows = {kind: samples.take(np.arange(min(batch, len(samples.agent)))) for kind, samples in lessons.items()}
+    for start, stop in ((0, 0), (0, batch - 1), (batch - 1, batch)):
+        assert store.sample() is None
+        few = {f"{kind}.{name}": x[start:stop] for kind, part in rows.items() for name, x in part._asdict().items()}
+        store.add(Experience(few, 1, {}))
+    sampled = store.sample()
+    assert sampled is not None and len(sampled.state) == batch
 
 
 def test_of_the_lessons_those_are_kept_in_which_the_planner_errs():

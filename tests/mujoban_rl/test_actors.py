@@ -56,6 +56,17 @@ def wait_for(condition, seconds=20.0):
         time.sleep(0.02)
 
 
+def test_a_store_with_too_little_for_a_batch_is_filled_before_the_first_update():
+    class Patient(LastFew):
+        def sample(self):
+            return super().sample() if len(self.kept) == 3 else None
+
+    source = ActorSource(LocalPool(Walkers(), 2), Patient(), steps_per_update=4.0)
+    source.publish({"weight": torch.zeros(1)}, 0)
+    assert source.next_batch() is not None
+    assert source.samples == 3 * STEPS > 4.0
+
+
 @pytest.mark.parametrize("make", [ThreadPool, ProcessPool])
 def test_the_same_streams_play_the_same_in_every_pool(make):
     local = played(LocalPool(Walkers(), 2, "ordered"))
