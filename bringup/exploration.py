@@ -26,12 +26,15 @@ from mujoban_core.interfaces import (
     put_rows,
     take_rows,
 )
+from mujoban_core.look_around import LookAroundPlanner
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sokoban.rules import apply
 
 _FOREVER: Final = 1 << 30
 _WALK: Final = 25
 """Random instructions in place of a planner that does not know what to do."""
+_WITS_END: Final = 4
+"""Instructions to stay in a row that show it: a planner that wants another look says so once or twice."""
 _PERSISTENCE: Final = 0.8
 """Correlation of the torques' noise from one tick to the next."""
 
@@ -105,35 +108,40 @@ class DisturbedTermination(Termination):
 
 
 class DisturbedPlanner(Planner):
-    """Follows another planner, except in episodes that are random walks and for stray instructions."""
+    """Follows another planner, except in episodes that are random walks and for stray instructions.
+
+    Memory: that of the other planner; how many more instructions are random, and how often in a row the other planner
+    has said to stay, int64 [B] each.
+    """
 
     def __init__(self, inner: Planner, disturbance: Disturbance, rng: np.random.Generator) -> None:
         """Wrap a planner."""
-        self.privileged = inner.privileged
+        self.privileged, self.thinks = inner.privileged, inner.thinks
         self._inner, self._disturbance, self._rng = inner, disturbance, rng
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return the inner memory and, last, how many more instructions are random, [B]."""
+        """Return the memory at the start of `batch` episodes."""
         wander = self._rng.random(batch) < self._disturbance.wander
-        return (*self._inner.initial_memory(batch), np.where(wander, _FOREVER, 0))
+        return (*self._inner.initial_memory(batch), np.where(wander, _FOREVER, 0), np.zeros(batch, np.int64))
+
+    def think(self, abstract_state: NDArray[np.float32], memory: Memory) -> Memory:
+        """Let the other planner think."""
+        return (*self._inner.think(abstract_state, tuple(memory[:-2])), *memory[-2:])
 
     def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
         """Return instructions, [M], from abstract states [M, N, N, 4]."""
-        *inner, wander = memory
-        instruction = np.zeros(len(wander), np.int64)
-        inner = tuple(m.copy() if isinstance(m, np.ndarray) else m.clone() for m in inner)
-        follow = np.flatnonzero(wander == 0)
+        inner, (wander, stays) = tuple(memory[:-2]), memory[-2:]
+        instruction, follow = np.zeros(len(wander), np.int64), np.flatnonzero(wander == 0)
         if follow.size:
-            planned, after = self._inner.decide(abstract_state[follow], take_rows(inner, follow))
-            instruction[follow] = planned
+            instruction[follow], after = self._inner.decide(abstract_state[follow], take_rows(inner, follow))
             inner = put_rows(inner, follow, after)
-        wander = np.maximum(wander - 1, 0)
+        stays = np.where((wander == 0) & (instruction == Instruction.STAY), stays + 1, 0)
         # A planner that is at its wits' end stays: walk on instead, so that the recording goes on showing something.
-        wander[follow[instruction[follow] == Instruction.STAY]] = _WALK
+        wander = np.where(stays == _WITS_END, _WALK, np.maximum(wander - 1, 0))
         stray = self._rng.random(len(wander)) < self._disturbance.stray
         for m in np.flatnonzero(stray | (wander > 0)):
             instruction[m] = self._random(abstract_state[m] > 0.5)
-        return instruction, (*inner, wander)
+        return instruction, (*inner, wander, stays)
 
     def _random(self, layers: NDArray[np.bool_]) -> int:
         """Draw an instruction, usually one that moves the robot; `layers` is [N, N, 4]."""
@@ -192,10 +200,15 @@ class DisturbedController(Controller):
 
 
 def disturbed(policy: SensePlanAct, disturbance: Disturbance, rng: np.random.Generator) -> SensePlanAct:
-    """Return a policy that does what the given one does, disturbed."""
+    """Return a policy that does what the given one does, disturbed; where it looks around, it goes on to."""
+    planner = policy.planner
+    if isinstance(planner, LookAroundPlanner):
+        planner = planner.for_planner(DisturbedPlanner(planner.inner, disturbance, rng))
+    else:
+        planner = DisturbedPlanner(planner, disturbance, rng)
     return SensePlanAct(
         policy.estimator,
         DisturbedTermination(policy.termination, disturbance, rng),
-        DisturbedPlanner(policy.planner, disturbance, rng),
+        planner,
         DisturbedController(policy.controller, disturbance, rng),
     )

@@ -99,6 +99,10 @@ class LookAroundPlanner(Planner):
         self.privileged = inner.privileged
         self.thinks = inner.thinks
 
+    def for_planner(self, inner: Planner) -> LookAroundPlanner:
+        """Return what makes another planner look around like this one."""
+        return LookAroundPlanner(inner, self.ticks, self.walks, self.scout)
+
     def initial_memory(self, batch: int) -> Memory:
         """Return the memory at the start of `batch` episodes, each of which begins with a look."""
         tick, until = np.zeros(batch, np.int64), np.full(batch, self.ticks)
