@@ -49,7 +49,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         module: "learned", "oracle" or `package.module:Class`; fixed when the node starts.
         weights: Weights file of the learned module; empty means those that ship. Setting it while the node
             runs loads them, and the module's memory restarts with the next tick. Weights that cannot be loaded
-            are refused, and the old ones stay.
+            are refused, and the old ones stay; so are those that need the ground truth where the node began without.
         device: Device of the learned module; setting it loads the weights again.
         threads: Threads of PyTorch in this process; at batch 1 further ones gain little on an idle machine, and on a
             busy one they wait for each other. Fixed when the node starts.
@@ -168,11 +168,13 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         current: dict[str, Any] = {name: self.get_parameter(name).value for name in ("weights", "device")}
         weights, device = (changed.get(name, value) for name, value in current.items())
         try:
-            self.module = self._load(weights, device)
+            module = self._load(weights, device)
+            if module.privileged and self.truth_inputs and not self._truth:
+                raise ValueError(f"weights {weights} need the ground truth: expected to be given when the node starts")
         except (ValueError, OSError, RuntimeError) as error:
             self.counts["refused weights"] += 1
             return SetParametersResult(successful=False, reason=str(error))
-        self.state = None
+        self.module, self.state = module, None
         self.counts["reloads"] += 1
         self.get_logger().info(f"loaded {weights or 'the weights that ship'} on {device}")
         return SetParametersResult(successful=True)

@@ -22,6 +22,7 @@ from bringup.graph import NODES, InProcess, Processes
 from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
+from mujoban_controller import teacher_weights
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import ANOTHER_RUN
 from mujoban_msgs_py.run_identifier import run_of
@@ -335,6 +336,20 @@ def test_weights_are_loaded_while_the_graph_runs_and_bad_ones_are_refused(play_g
     assert not refused.successful and "missing.safetensors" in refused.reason and estimator.module is module
     assert set_weights(fresh_weights.choices["estimator"].weights).successful
     assert estimator.module is not module
+    ticks = graph.simulator.ticks
+    graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
+
+
+def test_weights_that_need_the_ground_truth_are_refused_while_the_graph_runs(play_graph, oracles, fresh_weights):
+    stack = Stack(oracles.choices | {"controller": fresh_weights.choices["controller"]})
+    graph = play_graph(stack, time_limit=2000)
+    module = graph.graph.nodes["controller"].module
+    graph.spin_until(lambda: graph.simulator.ticks >= 3)
+    teacher = Parameter("weights", value=str(teacher_weights("ball"))).to_parameter_msg()
+    request = SetParameters.Request(parameters=[teacher])
+    refused = graph.call(SetParameters, "/controller/set_parameters", request).results[0]
+    assert not refused.successful and "ground truth" in refused.reason
+    assert graph.graph.nodes["controller"].module is module
     ticks = graph.simulator.ticks
     graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
 
