@@ -104,9 +104,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     episodes = play.make(VALIDATION_SEEDS.start if play.seed is None else play.seed)
     stack = options.modules.player(play.body)
     set_threads(stack.threads)
-    reporting = Reporting(
-        options.json, stack.identities(), len(episodes), generated=play.levels is None, body=play.body, world=play.world
-    )
+    reporting = Reporting(options.json, stack.identities(), episodes, body=play.body, world=play.world)
     with reporting:
         results, extra = _play(options, stack, episodes, reporting)
     reporting.finish(results, **extra)

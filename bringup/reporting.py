@@ -9,6 +9,7 @@ from typing import Any, Self
 
 from bringup.results import EpisodeResult, report, summary, use_of_test_levels, write_report
 from mujoban_core.signals import StopSignal
+from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import seed_range
 
 
@@ -19,21 +20,23 @@ class Reporting:
         results: Outcomes so far, in any order.
     """
 
-    def __init__(
-        self, path: Path | None, weights: Mapping[str, str], asked: int, *, generated: bool, **extra: Any
-    ) -> None:
+    def __init__(self, path: Path | None, weights: Mapping[str, str], episodes: Episodes, **extra: Any) -> None:
         """Describe the report.
 
         Args:
             path: File that takes it as JSON, if any.
             weights: Name of each module -> what identifies it.
-            asked: Number of episodes that are played.
-            generated: Whether their levels are generated, so that seeds tell which are kept for tests.
+            episodes: Which are played.
             **extra: Further entries.
+
+        Raises:
+            ValueError: If levels are generated from seeds that do not all lie in one range.
         """
         self.results: Sequence[EpisodeResult] = []
-        self._path, self._weights, self._asked = path, weights, asked
-        self._generated, self._extra = generated, extra
+        self._path, self._weights, self._asked, self._extra = path, weights, len(episodes), extra
+        # Of a level file seeds do not tell which levels are kept for tests.
+        generated = not episodes.source.levels
+        self._on_test_levels = generated and seed_range(episodes.seed, len(episodes)) == "test"
 
     def finish(self, results: Sequence[EpisodeResult], **extra: Any) -> None:
         """Print the summary and write the report.
@@ -42,8 +45,7 @@ class Reporting:
             OSError: If it cannot be written.
         """
         content = report(results, self._weights, **self._extra, **extra)
-        seeds = [result.seed for result in results]
-        if self._generated and seed_range(min(seeds), max(seeds) - min(seeds) + 1) == "test":
+        if self._on_test_levels:
             from mujoban_rl.weights import provenance
 
             content["test_uses"] = [use_of_test_levels(content, provenance()["commit"])]

@@ -83,9 +83,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         view=options.view,
     )
     weights = stack.identities()
-    reporting = Reporting(
-        options.json, weights, len(episodes), generated=play.levels is None, body=play.body, world=play.world
-    )
+    reporting = Reporting(options.json, weights, episodes, body=play.body, world=play.world)
     with reporting, _shown(len(episodes), None if options.headless else weights) as show:
 
         def on_refresh(monitor: MonitorNode, results: Sequence[EpisodeResult]) -> None:

@@ -17,12 +17,14 @@ import pytest
 
 from bringup import evaluate, record, run_stack, train
 from bringup.command import recorded_seed
+from bringup.reporting import Reporting
 from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.bags.training import episode_ticks, open_training_bag
 from mujoban_msgs_py.topics import GRAPH_TOPICS
 from mujoban_sim import rendering
+from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import TRAIN_SEEDS
 from mujoban_sokoban.levels import Level, write_levels
 
@@ -120,6 +122,19 @@ def test_places_for_output_are_checked_before_anything_is_played(capfd, monkeypa
     assert run(run_stack, "--headless", *options) == 2
     err = capfd.readouterr().err.strip()
     assert f"error: {options[0]} {options[1]}: " in err and why in err and "\n" not in err
+
+
+def test_seeds_of_two_ranges_are_refused_before_anything_is_played(capfd, monkeypatch, tmp_path):
+    for played in ("bringup.evaluate.evaluate", "bringup.stack.play"):
+        monkeypatch.setattr(played, lambda *args, **options: pytest.fail("went on"))
+    across = ["--seed", 4_999_999, "--episodes", 2, *ALL_ORACLES]
+    for command in (partial(run, evaluate), partial(run, run_stack, "--headless")):
+        assert command(*across) == 2
+        (line,) = capfd.readouterr().err.splitlines()
+        assert "error: seeds 4999999 to 5000000: expected all in one range (test 0 to 4999999; " in line
+    levels = tmp_path / "levels.txt"
+    write_levels(levels, [Level.from_text(UNSOLVABLE)])
+    Reporting(None, {}, Episodes(2, 4_999_999, level_file=levels))  # seeds say nothing of a file's levels
 
 
 def test_a_report_goes_through_a_device_and_never_replaces_it(tmp_path, capfd):
