@@ -131,7 +131,7 @@ def _play(
 
             how = PlayOptions(world=play.world, time_limit=play.time_limit)
             outcome = play_graph(stack, episodes, how, on_refresh=lambda _, ended: show(ended), refresh_period=1.0)
-            return outcome.results, {"ticks_per_second": outcome.ticks_per_second}
+            return outcome.results, outcome.figures()
         if policy is None:
             from bringup.cluster import evaluate_on_cluster
 

@@ -130,8 +130,10 @@ class InProcess:
         node.destroy_node()
 
     def counts(self) -> Counter[str]:
-        """Return the events that a user should know of, by node and kind."""
-        return Counter({f"{name}: {kind}": n for name, node in self.nodes.items() for kind, n in node.counts.items()})
+        """Return the events that a user should know of, by node and kind: of the graph and of those that were added."""
+        every = (*self.nodes.values(), *self._others)
+        counted = ((node.get_name(), getattr(node, "counts", {})) for node in every)
+        return Counter({f"{name}: {kind}": n for name, counts in counted for kind, n in counts.items()})
 
 
 class Processes:

@@ -93,7 +93,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         outcome = play_graph(stack, episodes, how, on_refresh=on_refresh)
     if not options.headless:
         Console().print(summary(outcome.results))
-    reporting.finish(outcome.results, ticks_per_second=outcome.ticks_per_second, counts=dict(outcome.counts))
+    reporting.finish(outcome.results, **outcome.figures())
     return 0
 
 

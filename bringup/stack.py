@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from rclpy.executors import Executor
 from rclpy.parameter import Parameter
@@ -76,7 +77,11 @@ class Outcome:
     ticks: int
     ticks_per_second: float
     counts: Counter[str]
-    """Events of the nodes that a user should know of."""
+    """Events that a user should know of: of the nodes in this process, and how often others were started again."""
+
+    def figures(self) -> dict[str, Any]:
+        """Return the entries of a report that tell how the graph ran."""
+        return {"ticks_per_second": self.ticks_per_second, "counts": dict(self.counts)}
 
 
 def play(
@@ -142,8 +147,7 @@ def play(
         if on_refresh is not None:  # a short run may have ended before the first refresh
             on_refresh(monitor, monitor.results)
         _drain(graph.executor, listeners, monitor.stamp)
-        counts = processes.counts() if options.processes else graph.counts()
-        counts += Counter({f"monitor: {kind}": n for kind, n in monitor.counts.items()})
+        counts = graph.counts() + (processes.counts() if options.processes else Counter())
         return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts)
 
 

@@ -229,6 +229,7 @@ def test_evaluate_gives_the_same_in_process_and_through_the_graph(tmp_path):
         assert "test_uses" not in json.loads(path.read_text())
         reports.append(json.loads(path.read_text()))
     assert reports[0]["episodes"] == reports[1]["episodes"]
+    assert reports[1]["counts"].keys() <= {"simulator: repeated ticks"} and reports[1]["ticks_per_second"] > 0
 
 
 def test_an_unsolvable_level_is_played_and_said_to_be(tmp_path, capfd):

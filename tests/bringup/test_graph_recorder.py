@@ -11,6 +11,7 @@ from bringup.rollout import ticks
 from bringup.rollout_recorder import TOPICS as ROLLOUT_TOPICS
 from bringup.rollout_recorder import Recorder
 from bringup.stack import PlayOptions, play
+from mujoban_controller.node import ControllerNode
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, open_bag
 from mujoban_msgs_py.conversions import stamp_of
@@ -123,3 +124,15 @@ def test_in_real_time_what_was_not_recorded_is_counted(play_graph, tmp_path):
     graph.spin_until(lambda: recorder.written)
     graph.graph.stop("controller")
     graph.spin_until(lambda: recorder.counts["/torque not recorded"] >= 3)
+
+
+def test_what_a_bag_in_real_time_lacks_is_in_the_outcome(oracles, tmp_path, monkeypatch):
+    step = ControllerNode.step
+
+    def now_and_then(node, episode, inputs, truth):
+        return () if episode.step % 4 == 1 else step(node, episode, inputs, truth)
+
+    monkeypatch.setattr(ControllerNode, "step", now_and_then)
+    options = PlayOptions(record=tmp_path / "bag", realtime=4.0, time_limit=12)
+    counts = play(oracles, Episodes(1, 0, difficulty=2), options).counts
+    assert counts["recorder: /torque not recorded"] >= 3
