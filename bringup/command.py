@@ -22,6 +22,7 @@ from mujoban_core.plugins import (
     ROLES,
     SCOUT,
     SCRIPTED,
+    check_body,
     load_module,
     load_scout,
     shipped_weights,
@@ -164,16 +165,6 @@ class Solo:
 
 Player = Stack | Solo
 """What commands play with."""
-
-
-def check_body(role: str, module: Module, body: str) -> None:
-    """Raise a `ValueError` if a learned module was trained for another body than the one that is played."""
-    config = getattr(module, "config", {})
-    trained = config.get("body") if isinstance(config, dict) else getattr(config, "body", None)
-    if trained not in (None, body):
-        raise ValueError(
-            f"the {role} was trained for the body {trained}: expected weights for {body}, or --oracle {role}"
-        )
 
 
 def recorded_seed(seed: int | None, *, records: bool, allow_test_seeds: bool) -> int:

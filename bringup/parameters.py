@@ -79,6 +79,7 @@ def _loaded(choice: Choice, player: Player) -> dict[str, Any]:
     return {
         "module": choice.source,
         "weights": "" if choice.weights is None else str(choice.weights),
+        "body": player.body,
         "device": player.device,
         "threads": player.threads,
     }

@@ -15,7 +15,7 @@ from typing import Any
 from rclpy.executors import Executor
 from rclpy.parameter import Parameter
 
-from bringup.command import Player, Solo, check_body
+from bringup.command import Player, Solo
 from bringup.domain import claim_domain
 from bringup.graph import RESPAWN_PERIOD, GraphError, InProcess, Processes
 from bringup.graph_recorder import RecorderNode
@@ -26,7 +26,6 @@ from bringup.video import EDGE, VideoNode
 from mujoban_core import children
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.plugins import AGENT, ROLES
 from mujoban_core.signals import StopSignal
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.run_identifier import ANY, draw_run
@@ -125,8 +124,6 @@ def play(
         exits.enter_context(ros_context())
         graph = exits.enter_context(InProcess(parameters, () if options.processes else parameters))
         alone = isinstance(stack, Solo)
-        for role in () if options.processes else (AGENT,) if alone else ROLES:
-            check_body(role, graph.nodes[role].module, stack.body)  # pyright: ignore[reportAttributeAccessIssue]
         monitor = graph.add(MonitorNode(episodes, alone=alone, run=options.run))
         stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []

@@ -68,6 +68,14 @@ def load_module(role: str, source: str = LEARNED, weights: Path | None = None, d
     return _make(role, _interface(role), source, weights, device)
 
 
+def check_body(role: str, module: Module, body: str) -> None:
+    """Raise a `ValueError` if a learned module was trained for another body than the one that is played."""
+    config = getattr(module, "config", {})
+    trained = config.get("body") if isinstance(config, dict) else getattr(config, "body", None)
+    if trained not in (None, body):
+        raise ValueError(f"the {role} was trained for the body {trained}: expected weights for {body}, or an oracle")
+
+
 def load_scout(source: str, weights: Path | None = None, device: str = "cpu") -> Scout:
     """Return what says where to look before pushing.
 

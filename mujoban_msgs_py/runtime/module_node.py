@@ -16,7 +16,7 @@ from rclpy.serialization import serialize_message
 
 from mujoban_core.interfaces import GroundTruth, Module, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
-from mujoban_core.plugins import LEARNED, PRIVILEGED, load_module
+from mujoban_core.plugins import LEARNED, PRIVILEGED, check_body, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
@@ -50,6 +50,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         weights: Weights file of the learned module; empty means those that ship. Setting it while the node
             runs loads them, and the module's memory restarts with the next tick. Weights that cannot be loaded
             are refused, and the old ones stay; so are those that need the ground truth where the node began without.
+        body: The robot's body, of which the weights have to be; empty means any. Fixed when the node starts.
         device: Device of the learned module; setting it loads the weights again.
         threads: Threads of PyTorch in this process; at batch 1 further ones gain little on an idle machine, and on a
             busy one they wait for each other. Fixed when the node starts.
@@ -70,7 +71,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         """Load the module and start listening.
 
         Raises:
-            ValueError: If the module or its weights cannot be loaded, or `resume_file` is none.
+            ValueError: If the module or its weights cannot be loaded or are of another body, or `resume_file` is none.
         """
         super().__init__(self.role, **options)
         self.run = declare_run(self)
@@ -78,6 +79,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         which = described("learned, oracle or package.module:Class", fixed=True)
         self._source = declare(self, "module", LEARNED, which)
         weights = declare(self, "weights", "", described("weights file; empty: those that ship"))
+        whose = described("the robot's body, of which the weights have to be; empty: any", fixed=True)
+        self._body = declare(self, "body", "", whose)
         device = declare(self, "device", "cpu", described("cpu or cuda, such as cuda:0"))
         seeds = described("seed of the module's random streams", fixed=True, low=0, high=2**31 - 1)
         self._run_seed = declare(self, "run_seed", 0, seeds)
@@ -149,6 +152,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
 
     def _load(self, weights: str, device: str) -> ModuleT:
         module = load_module(self.role, self._source, Path(weights) if weights else None, device)
+        if self._body:
+            check_body(self.role, module, self._body)
         # `load_module` has checked that it is of the role.
         return cast(ModuleT, look_around(self.prepare(module), self._look_around, self.scout))
 

@@ -3,6 +3,8 @@
 import errno
 import re
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from bringup.command import Choice, Stack
 from bringup.graph import NODES, InProcess, Processes
 from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
-from bringup.parameters import graph_parameters
+from bringup.parameters import graph_parameters, write_parameters
 from mujoban_controller import teacher_weights
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import ANOTHER_RUN
@@ -352,6 +354,22 @@ def test_weights_that_need_the_ground_truth_are_refused_while_the_graph_runs(pla
     assert graph.graph.nodes["controller"].module is module
     ticks = graph.simulator.ticks
     graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
+
+
+def test_weights_of_another_body_are_refused_by_a_node_when_it_starts_and_while_it_runs(
+    play_graph, oracles, ant_teacher, tmp_path
+):
+    played = Stack(oracles.choices | {"controller": Choice("controller", weights=ant_teacher)}, body="ant")
+    graph = play_graph(played, names=["controller"])
+    ball = Parameter("weights", value=str(teacher_weights("ball"))).to_parameter_msg()
+    request = SetParameters.Request(parameters=[ball])
+    refused = graph.call(SetParameters, "/controller/set_parameters", request).results[0]
+    why = "the controller was trained for the body ball: expected weights for ant, or an oracle"
+    assert not refused.successful and refused.reason == why
+    write_parameters(graph_parameters(Stack(body="ant"), Episodes(1, 0)), tmp_path / "ant.yaml")
+    command = [sys.executable, "-m", "mujoban_controller.node", "--ros-args", "--params-file", tmp_path / "ant.yaml"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (2, f"error: {why}\n")
 
 
 @pytest.mark.parametrize(
