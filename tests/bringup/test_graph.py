@@ -1,10 +1,8 @@
-"""What the graph bears: nodes that die, services, bad input, a clock that does not wait, weights that change."""
+"""What the graph bears: nodes that die, services, bad input, a clock that does not wait."""
 
 import errno
 import re
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -12,24 +10,18 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.srv import SetParameters
-from rclpy.exceptions import InvalidParameterValueException
-from rclpy.parameter import Parameter
 from safetensors.numpy import save
 from sensor_msgs.msg import Image, JointState
 from std_srvs.srv import SetBool, Trigger
 
 from bringup.command import Choice, Stack
 from bringup.graph import NODES, InProcess, Processes
-from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
-from bringup.parameters import graph_parameters, write_parameters
-from mujoban_controller import teacher_weights
+from bringup.parameters import graph_parameters
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import ANOTHER_RUN
 from mujoban_msgs_py.run_identifier import run_of
 from mujoban_msgs_py.topics import TICK
-from mujoban_sim.node import PARAMETERS, SimulatorNode
 from mujoban_sokoban.episodes import Episodes
 
 MODULES = ("estimator", "termination", "planner", "controller")
@@ -321,99 +313,3 @@ def test_real_time_keeps_to_the_clock(play_graph):
 def test_real_time_that_is_kept_is_not_complained_of_when_the_clock_starts(play_graph, capfd):
     play_graph(realtime=0.25, time_limit=2).finish()
     assert "not kept" not in capfd.readouterr().err
-
-
-def test_weights_are_loaded_while_the_graph_runs_and_bad_ones_are_refused(play_graph, oracles, fresh_weights, tmp_path):
-    stack = Stack(oracles.choices | {"estimator": fresh_weights.choices["estimator"]})
-    graph = play_graph(stack, time_limit=2000)
-    estimator = graph.graph.nodes["estimator"]
-    graph.spin_until(lambda: graph.simulator.ticks >= 3)
-    module = estimator.module
-
-    def set_weights(path):
-        request = SetParameters.Request(parameters=[Parameter("weights", value=str(path)).to_parameter_msg()])
-        return graph.call(SetParameters, "/estimator/set_parameters", request).results[0]
-
-    refused = set_weights(tmp_path / "missing.safetensors")
-    assert not refused.successful and "missing.safetensors" in refused.reason and estimator.module is module
-    assert set_weights(fresh_weights.choices["estimator"].weights).successful
-    assert estimator.module is not module
-    ticks = graph.simulator.ticks
-    graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
-
-
-def test_weights_that_need_the_ground_truth_are_refused_while_the_graph_runs(play_graph, oracles, fresh_weights):
-    stack = Stack(oracles.choices | {"controller": fresh_weights.choices["controller"]})
-    graph = play_graph(stack, time_limit=2000)
-    module = graph.graph.nodes["controller"].module
-    graph.spin_until(lambda: graph.simulator.ticks >= 3)
-    teacher = Parameter("weights", value=str(teacher_weights("ball"))).to_parameter_msg()
-    request = SetParameters.Request(parameters=[teacher])
-    refused = graph.call(SetParameters, "/controller/set_parameters", request).results[0]
-    assert not refused.successful and "ground truth" in refused.reason
-    assert graph.graph.nodes["controller"].module is module
-    ticks = graph.simulator.ticks
-    graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
-
-
-def test_weights_of_another_body_are_refused_by_a_node_when_it_starts_and_while_it_runs(
-    play_graph, oracles, ant_teacher, tmp_path
-):
-    played = Stack(oracles.choices | {"controller": Choice("controller", weights=ant_teacher)}, body="ant")
-    graph = play_graph(played, names=["controller"])
-    ball = Parameter("weights", value=str(teacher_weights("ball"))).to_parameter_msg()
-    request = SetParameters.Request(parameters=[ball])
-    refused = graph.call(SetParameters, "/controller/set_parameters", request).results[0]
-    why = "the controller was trained for the body ball: expected weights for ant, or an oracle"
-    assert not refused.successful and refused.reason == why
-    write_parameters(graph_parameters(Stack(body="ant"), Episodes(1, 0)), tmp_path / "ant.yaml")
-    command = [sys.executable, "-m", "mujoban_controller.node", "--ros-args", "--params-file", tmp_path / "ant.yaml"]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (2, f"error: {why}\n")
-
-
-@pytest.mark.parametrize(
-    ("node", "name", "value", "reason"),
-    [
-        ("estimator", "device", "cuda:7", "device 'cuda:7': torch can use .* expected cpu"),
-        ("estimator", "device", "meta", "device 'meta': expected cpu or cuda"),
-        ("termination", "threshold", float("nan"), "threshold is nan|range"),
-        ("termination", "threshold", 1.5, "range"),
-        ("termination", "limit", -3, "limit is -3: expected a number of ticks|range"),
-    ],
-)
-def test_a_setting_out_of_its_range_is_refused_with_the_reason(
-    play_graph, oracles, fresh_weights, node, name, value, reason
-):
-    graph = play_graph(Stack(oracles.choices | {"estimator": fresh_weights.choices["estimator"]}), names=[node])
-    before = graph.graph.nodes[node].get_parameter(name).value
-    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-    result = graph.call(SetParameters, f"/{node}/set_parameters", request).results[0]
-    assert not result.successful and re.search(reason, result.reason), result.reason
-    assert graph.graph.nodes[node].get_parameter(name).value == before
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("difficulty", 6), ("realtime", -1.0), ("resend_after", 0.0), ("episodes", -1)]
-)
-@pytest.mark.usefixtures("ros")
-def test_a_simulator_is_not_made_with_a_parameter_out_of_its_range(name, value):
-    with pytest.raises(InvalidParameterValueException, match=rf"(?s)\b{name}\b.*range"):
-        SimulatorNode(parameter_overrides=[Parameter(name, value=value)])
-
-
-def test_every_parameter_of_the_simulator_and_the_recorder_says_what_it_means(play_graph, tmp_path):
-    simulator = play_graph().simulator
-    path = Parameter("path", value=str(tmp_path / "bag"))
-    recorder = RecorderNode(context=simulator.context, parameter_overrides=[path])
-    try:
-        for node, own in ((simulator, PARAMETERS), (recorder, ("path", "episodes_per_file", "body", "world"))):
-            assert all(about.description for about in node.describe_parameters(list(own)))
-    finally:
-        recorder.destroy_node()
-
-
-def test_missing_weights_stop_a_node_with_a_clear_error(play_graph, oracles, tmp_path):
-    choices = oracles.choices | {"planner": Choice("planner", weights=tmp_path / "none.safetensors")}
-    with pytest.raises(ValueError, match="none"):
-        play_graph(Stack(choices))
