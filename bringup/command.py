@@ -130,6 +130,10 @@ class Stack:
         scout = {SCOUT: self.scout.identity()} if self.look_around_ticks else {}
         return {role: choice.identity() for role, choice in self.choices.items()} | scout
 
+    def settings(self) -> dict[str, int]:
+        """Return what a report says, beside `identities`, of how the modules play."""
+        return {"look_around": self.look_around_ticks, "look_ahead": self.look_ahead}
+
 
 @dataclass(frozen=True)
 class Solo:
@@ -161,6 +165,10 @@ class Solo:
         if self.choice.load().privileged and not identity.endswith(PRIVILEGED):
             identity += PRIVILEGED
         return {AGENT: identity}
+
+    def settings(self) -> dict[str, int]:
+        """Return what a report says, beside `identities`, of how the agent plays: nothing."""
+        return {}
 
 
 Player = Stack | Solo

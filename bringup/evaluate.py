@@ -97,14 +97,14 @@ def main(command_line: Sequence[str] | None = None) -> int:
     options = read_options(Options, command_line, called(PROG), __doc__)
     check_file("--json", options.json)
     import_from_here()
-    from bringup.reporting import Reporting
+    from bringup.reporting import Reporting, played
     from mujoban_sokoban.generator import VALIDATION_SEEDS
 
     play = options.play
     episodes = play.make(VALIDATION_SEEDS.start if play.seed is None else play.seed)
     stack = options.modules.player(play.body)
     set_threads(stack.threads)
-    reporting = Reporting(options.json, stack.identities(), episodes, body=play.body, world=play.world)
+    reporting = Reporting(options.json, stack.identities(), episodes, played(stack, episodes, play))
     with reporting:
         results, extra = _play(options, stack, episodes, reporting)
     reporting.finish(results, **extra)

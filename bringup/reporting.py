@@ -7,10 +7,44 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from bringup.command import Player
+from bringup.options import EpisodeOptions
 from bringup.results import EpisodeResult, report, summary, use_of_test_levels, write_report
+from mujoban_core.bodies import get_body
+from mujoban_core.files import digest
 from mujoban_core.signals import StopSignal
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import seed_range
+
+
+def played(player: Player, episodes: Episodes, options: EpisodeOptions, *, realtime: float = 0.0) -> dict[str, Any]:
+    """Return what a report says of the game, beside who played it.
+
+    Args:
+        player: The modules, or an agent.
+        episodes: Which are played.
+        options: World, body and time limit.
+        realtime: Simulated seconds per second; 0 is lockstep.
+
+    Returns:
+        `difficulty` of generated levels, or `level_file` with its SHA-256; `seed` of the first episode; `time_limit` in
+        steps; `body`, `world`, `realtime`; and the settings of the player. What does not apply is None.
+
+    Raises:
+        OSError: If the level file cannot be read.
+    """
+    file = episodes.level_file
+    return {
+        "difficulty": episodes.difficulty or None,
+        "level_file": None if file is None else str(file),
+        "level_file_sha256": None if file is None else digest(file),
+        "seed": episodes.seed,
+        "time_limit": options.time_limit or get_body(options.body).time_limit,
+        "body": options.body,
+        "world": options.world,
+        "realtime": realtime,
+        **player.settings(),
+    }
 
 
 class Reporting:
@@ -20,20 +54,23 @@ class Reporting:
         results: Outcomes so far, in any order.
     """
 
-    def __init__(self, path: Path | None, weights: Mapping[str, str], episodes: Episodes, **extra: Any) -> None:
+    def __init__(
+        self, path: Path | None, weights: Mapping[str, str], episodes: Episodes, game: Mapping[str, Any]
+    ) -> None:
         """Describe the report.
 
         Args:
             path: File that takes it as JSON, if any.
             weights: Name of each module -> what identifies it.
             episodes: Which are played.
-            **extra: Further entries.
+            game: What `played` tells of it.
 
         Raises:
             ValueError: If levels are generated from seeds that do not all lie in one range.
         """
         self.results: Sequence[EpisodeResult] = []
-        self._path, self._weights, self._asked, self._extra = path, weights, len(episodes), extra
+        self._path, self._weights, self._asked = path, weights, len(episodes)
+        self._game = {"body": game["body"], "world": game["world"], "played": dict(game)}
         # Of a level file seeds do not tell which levels are kept for tests.
         generated = not episodes.source.levels
         self._on_test_levels = generated and seed_range(episodes.seed, len(episodes)) == "test"
@@ -41,10 +78,14 @@ class Reporting:
     def finish(self, results: Sequence[EpisodeResult], **extra: Any) -> None:
         """Print the summary and write the report.
 
+        Args:
+            results: The episodes.
+            **extra: Further entries.
+
         Raises:
             OSError: If it cannot be written.
         """
-        content = report(results, self._weights, **self._extra, **extra)
+        content = report(results, self._weights, **self._game, **extra)
         if self._on_test_levels:
             from mujoban_rl.weights import provenance
 

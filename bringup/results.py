@@ -119,14 +119,15 @@ def _brief(identity: str) -> str:
 
 
 def use_of_test_levels(content: Mapping[str, Any], commit: str | None) -> dict[str, Any]:
-    """Return the entry of a report's `test_uses` list: what was evaluated on test levels, and on which.
+    """Return the entry of a report's `test_uses` list: what was evaluated on test levels, on which, and how.
 
     Args:
-        content: The report.
+        content: The report; where it does not say what was `played`, the entry has None.
         commit: Of the code.
     """
     seeds = [entry["seed"] for entry in content["episodes"]]
-    return {"commit": commit, "weights": content["weights"], "seeds": [min(seeds), max(seeds)]}
+    where = {"seeds": [min(seeds), max(seeds)], "played": content.get("played")}
+    return {"commit": commit, "weights": content["weights"], **where}
 
 
 def write_report(content: Mapping[str, Any], path: Path) -> None:

@@ -67,7 +67,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
 
     from rich.console import Console
 
-    from bringup.reporting import Reporting
+    from bringup.reporting import Reporting, played
     from bringup.stack import PlayOptions
     from bringup.stack import play as play_graph
     from bringup.view import summary
@@ -83,7 +83,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         view=options.view,
     )
     weights = stack.identities()
-    reporting = Reporting(options.json, weights, episodes, body=play.body, world=play.world)
+    reporting = Reporting(options.json, weights, episodes, played(stack, episodes, play, realtime=options.realtime))
     with reporting, _shown(len(episodes), None if options.headless else weights) as show:
 
         def on_refresh(monitor: MonitorNode, results: Sequence[EpisodeResult]) -> None:

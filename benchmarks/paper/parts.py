@@ -90,17 +90,33 @@ def _join(parts: list[Part]) -> dict[str, Any]:
     """Return the report of all parts together.
 
     Raises:
-        ValueError: If they were not measured with the same weights.
+        ValueError: If they were not measured with the same weights, or otherwise not alike.
     """
-    reports = [part.load() for part in parts]
-    weights = {json.dumps(content["weights"], sort_keys=True) for content in reports if content is not None}
-    if None in reports or len(weights) != 1:
+    reports = [content for part in parts if (content := part.load()) is not None]
+    weights = {json.dumps(content["weights"], sort_keys=True) for content in reports}
+    if len(reports) < len(parts) or len(weights) != 1:
         raise ValueError(f"{parts[0].run.name}: the weights changed while it ran; the same command goes on")
-    episodes = [_episode(entry) for content in reports if content is not None for entry in content["episodes"]]
-    joined = report(episodes, json.loads(weights.pop()))
+    episodes = [_episode(entry) for content in reports for entry in content["episodes"]]
+    joined = report(episodes, json.loads(weights.pop()), **_common(parts[0].run, reports))
     # The parts are one use of the test levels together.
-    commits = {use["commit"] for content in reports if content for use in content.get("test_uses", [])}
+    commits = {use["commit"] for content in reports for use in content.get("test_uses", [])}
     return {**joined, "test_uses": [use_of_test_levels(joined, ", ".join(sorted(map(str, commits))))]}
+
+
+def _common(run: Run, reports: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what all parts say of how they were played; those that an earlier version measured may say less.
+
+    Raises:
+        ValueError: If they were played otherwise than each other.
+    """
+    said = [{key: content[key] for key in ("body", "world", "played") if key in content} for content in reports]
+    for entry in said:
+        if "played" in entry:
+            entry["played"] = {**entry["played"], "seed": SEED}  # of the first part
+    common = {key: value for key, value in said[0].items() if all(key in entry for entry in said)}
+    if any(entry[key] != value for entry in said for key, value in common.items()):
+        raise ValueError(f"{run.name}: its parts were played differently; --again measures them anew")
+    return common
 
 
 def _episode(entry: dict[str, Any]) -> EpisodeResult:

@@ -84,11 +84,25 @@ def test_an_evaluation_goes_on_where_it_was_ended_and_gives_what_one_run_gives(f
     parts.evaluate(EASY, options)
     whole = runs.load(EASY)
     assert [episode["seed"] for episode in whole["episodes"]] == [1000, 1001, 1002] and whole["success_rate"] == 1.0
+    game = whole["played"]
+    assert (game["difficulty"], game["seed"], game["look_ahead"]) == (1, 1000, 0) and game["world"] == whole["world"]
+    assert [use["played"] for use in whole["test_uses"]] == [game]
     assert "easy: 3 of 3 levels, solved 3 (100.0 %)" in capfd.readouterr().out
     EASY.file.unlink()
     monkeypatch.setattr(parts.Part, "start", lambda part: pytest.fail(f"{part} has been measured already"))
     parts.evaluate(EASY, options)
     assert runs.load(EASY) == whole
+    second = parts.Part(EASY, 2, 1)
+    content = second.load()
+    write_report({**content, "played": {**content["played"], "look_ahead": 400}}, second.file)
+    with pytest.raises(ValueError, match="easy: its parts were played differently; --again measures them anew"):
+        parts.evaluate(EASY, options)
+    # A part that an earlier version measured says less, and then so does the whole.
+    write_report({key: value for key, value in content.items() if key != "played"}, second.file)
+    parts.evaluate(EASY, options)
+    joined = runs.load(EASY)
+    assert "played" not in joined and joined["body"] == "ball" and joined["episodes"] == whole["episodes"]
+    assert joined["test_uses"][-1]["played"] is None
 
 
 def test_a_long_curve_is_thinned_to_means_that_weigh_instructions_alike(tmp_path):

@@ -16,8 +16,11 @@ import imageio.v2 as imageio
 import pytest
 
 from bringup import evaluate, record, run_stack, train
-from bringup.command import recorded_seed
-from bringup.reporting import Reporting
+from bringup.command import Stack, recorded_seed
+from bringup.options import EpisodeOptions
+from bringup.reporting import Reporting, played
+from mujoban_core.files import digest
+from mujoban_core.look_around import LOOK_AROUND_TICKS
 from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import open_bag
@@ -75,6 +78,25 @@ def test_every_use_of_the_test_levels_is_kept_in_the_report(tmp_path):
     uses = json.loads(path.read_text())["test_uses"]
     assert [use["seeds"] for use in uses] == [[1000, 1001], [1001, 1002]]
     assert all(use["weights"]["planner"] == "oracle" and "commit" in use for use in uses)
+    assert [(use["played"]["difficulty"], use["played"]["time_limit"]) for use in uses] == [(1, 3), (1, 3)]
+
+
+def test_a_report_says_what_was_played(tmp_path):
+    path, levels = tmp_path / "report.json", tmp_path / "levels.txt"
+    write_levels(levels, [Level.from_text(UNSOLVABLE)])
+    game = {
+        "difficulty": 1, "level_file": None, "level_file_sha256": None, "seed": 5_000_007, "time_limit": 3,
+        "body": "ball", "world": "reference", "realtime": 0.0, "look_around": 7, "look_ahead": 0,
+    }  # fmt: skip
+    few = ["--episodes", 1, "--seed", 5_000_007, "--world", "reference", *ALL_ORACLES, "--json", path]
+    assert run(evaluate, *few, "--difficulty", 1, "--time-limit", 3, "--look-around", 7) == 0
+    assert json.loads(path.read_text())["played"] == game
+    filed = {"difficulty": None, "level_file": str(levels), "level_file_sha256": digest(levels)}
+    assert run(run_stack, "--headless", *few, "--levels", levels, "--time-limit", 3, "--realtime", 9) == 0
+    assert json.loads(path.read_text())["played"] == {**game, **filed, "look_around": 0, "realtime": 9.0}
+    searching = Stack(look_ahead=400, body="ant")
+    told = played(searching, Episodes(1, 0), EpisodeOptions(body="ant"))
+    assert told["look_ahead"] == 400 and told["look_around"] == LOOK_AROUND_TICKS and told["time_limit"] == 9600
 
 
 def test_a_summary_on_the_terminal_names_lost_seeds_by_cause(capfd):
@@ -125,8 +147,8 @@ def test_places_for_output_are_checked_before_anything_is_played(capfd, monkeypa
 
 
 def test_seeds_of_two_ranges_are_refused_before_anything_is_played(capfd, monkeypatch, tmp_path):
-    for played in ("bringup.evaluate.evaluate", "bringup.stack.play"):
-        monkeypatch.setattr(played, lambda *args, **options: pytest.fail("went on"))
+    for name in ("bringup.evaluate.evaluate", "bringup.stack.play"):
+        monkeypatch.setattr(name, lambda *args, **options: pytest.fail("went on"))
     across = ["--seed", 4_999_999, "--episodes", 2, *ALL_ORACLES]
     for command in (partial(run, evaluate), partial(run, run_stack, "--headless")):
         assert command(*across) == 2
@@ -134,7 +156,8 @@ def test_seeds_of_two_ranges_are_refused_before_anything_is_played(capfd, monkey
         assert "error: seeds 4999999 to 5000000: expected all in one range (test 0 to 4999999; " in line
     levels = tmp_path / "levels.txt"
     write_levels(levels, [Level.from_text(UNSOLVABLE)])
-    Reporting(None, {}, Episodes(2, 4_999_999, level_file=levels))  # seeds say nothing of a file's levels
+    filed = Episodes(2, 4_999_999, level_file=levels)
+    Reporting(None, {}, filed, played(Stack(), filed, EpisodeOptions()))  # seeds say nothing of a file's levels
 
 
 def test_a_report_goes_through_a_device_and_never_replaces_it(tmp_path, capfd):
