@@ -46,9 +46,8 @@ class Compass(nn.Module):
             proprio: o_pr, [B, P].
             needle: Before the tick, [B, 2]; zeros at an episode's start.
         """
-        # The turn about the vertical, whichever way the robot leans.
-        rate = (proprio[:, self._part.angular_velocity] * proprio[:, self._part.up_axis]).sum(-1)
-        cos, sin = (CONTROL_PERIOD * rate).cos(), (CONTROL_PERIOD * rate).sin()
+        turned = CONTROL_PERIOD * self._part.turn_rate(proprio)
+        cos, sin = turned.cos(), turned.sin()
         x, y = needle.unbind(-1)
         return _KEPT * torch.stack([cos * x - sin * y, sin * x + cos * y], -1) + shown
 

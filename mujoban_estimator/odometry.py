@@ -90,8 +90,7 @@ class Odometry:
         """Return the heading of each tick, [B, T]."""
         if self.heading is not None:
             return proprio[..., self.heading]
-        turned = CONTROL_PERIOD * proprio[..., self.part.yaw_rate].squeeze(-1)
-        return track.heading[:, None] + turned.cumsum(1)
+        return track.heading[:, None] + (CONTROL_PERIOD * self.part.turn_rate(proprio)).cumsum(1)
 
     def _features(self, proprio: Tensor, velocity: Tensor, direction: Tensor, track: Track) -> Tensor:
         stay = (direction == 0).all(dim=-1, keepdim=True)
@@ -104,7 +103,7 @@ class Odometry:
         columns = [
             turn(heading, direction),  # 2
             turn(velocity, direction),  # 2
-            proprio[..., self.part.yaw_rate] / 4,  # 1: yaw rate
+            self.part.turn_rate(proprio)[..., None] / 4,  # 1
             turn(track.position - track.start, direction).clamp(-2, 2),  # 2
             target.clamp(-2, 2), (target * 5).clamp(-2, 2),  # 4
             home.clamp(-2, 2), (home * 5).clamp(-2, 2),  # 4

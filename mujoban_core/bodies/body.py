@@ -14,12 +14,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.camera import CameraMount
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FIRST_PERSON_CAMERA: Final = "first_person"
 """Name of the camera that every body carries; it yields o_cam."""
@@ -144,8 +147,6 @@ class ProprioSlices(NamedTuple):
     """The first three together."""
     planar_velocity: slice
     """Forwards and to the left, the first two values of `linear_velocity`."""
-    yaw_rate: slice
-    """About the robot's z-axis, the last value of `angular_velocity`."""
 
     @classmethod
     @cache
@@ -163,8 +164,11 @@ class ProprioSlices(NamedTuple):
             size=up_axis + UP_AXIS_SIZE,
             inertial=slice(0, INERTIAL_SIZE),
             planar_velocity=slice(0, 2),
-            yaw_rate=slice(5, 6),
         )
+
+    def turn_rate(self, proprio: Tensor) -> Tensor:
+        """Return the rate of turning about the vertical, however the robot leans, [...] rad/s, given o_pr, [..., P]."""
+        return (proprio[..., self.angular_velocity] * proprio[..., self.up_axis]).sum(-1)
 
 
 @dataclass(frozen=True)
