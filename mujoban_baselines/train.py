@@ -112,9 +112,7 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
     if config.start is None:
         agent = MonolithicAgent(body, config.size)
     else:
-        agent = load_weights(MonolithicAgent, config.start).train()
-        if agent.config["body"] != body:
-            raise ValueError(f"--start {config.start}: of the body {agent.config['body']}, expected {body}")
+        agent = load_weights(MonolithicAgent, config.start, body=body).train()
     build = partial(MonolithicAgent, **agent.config)
     critic: Critic = AsymmetricCritic(body) if config.critic == "asymmetric" else SymmetricCritic(body, agent.width)
     streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(2)]

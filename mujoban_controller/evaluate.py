@@ -19,12 +19,13 @@ from typing import Literal
 
 import torch
 
-from mujoban_controller import SHIPPED
+from mujoban_controller import SHIPPED, teacher_weights
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.drivers import Driver
 from mujoban_controller.judge import judge
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
+from mujoban_core.bodies import BALL
 from mujoban_core.files import check_file, digest
 from mujoban_core.program import give_report, read_options, run_command
 from mujoban_rl.weights import load_weights
@@ -64,19 +65,18 @@ class Options:
             raise ValueError(f"--episodes {self.episodes}: expected at least 1")
         if seed_range(self.seed, self.episodes) == "training":
             raise ValueError(f"--seed {self.seed}: expected seeds of validation or test, not of training")
-        if self.driver == "teacher" and self.weights is None:
-            raise ValueError("--driver teacher: expected --weights of a privileged policy")
+        if self.driver == "scripted" and self.body != BALL.name:
+            raise ValueError(f"--driver scripted: drives the {BALL.name} alone, not --body {self.body}")
 
 
 def make_driver(options: Options) -> tuple[Driver, str]:
     """Return the driver and what identifies it: the digest of its weights, or its name."""
     if options.driver == "scripted":
         return scripted_driver, "scripted"
-    cls = PrivilegedPolicy if options.driver == "teacher" else VisuomotorController
-    weights = options.weights or SHIPPED
-    policy = load_weights(cls, weights, options.device)
-    if policy.config["body"] != options.body:
-        raise ValueError(f"--body {options.body}: the weights are of the body {policy.config['body']}")
+    teacher = options.driver == "teacher"
+    cls = PrivilegedPolicy if teacher else VisuomotorController
+    weights = options.weights or (teacher_weights(options.body) if teacher else SHIPPED)
+    policy = load_weights(cls, weights, options.device, body=options.body)
     return policy.driver(), digest(weights)
 
 

@@ -191,7 +191,7 @@ class _Parts:
     def _distil(self) -> tuple[Learner[Any], Source[Any]]:
         config, student = self.config, self._camera()
         assert config.teacher is not None
-        teacher = load_weights(PrivilegedPolicy, config.teacher)
+        teacher = load_weights(PrivilegedPolicy, config.teacher, body=config.task.body)
         learner = DistilLearner(student, config.distil, self.generator(), self.validation)
 
         def player() -> Player:
@@ -240,13 +240,13 @@ class _Parts:
     def _privileged(self, scale: float) -> PrivilegedPolicy:
         config = self.config
         if config.initial is not None:
-            return load_weights(PrivilegedPolicy, config.initial).train()
+            return load_weights(PrivilegedPolicy, config.initial, body=config.task.body).train()
         return PrivilegedPolicy(config.task.body, scale=scale)
 
     def _camera(self) -> VisuomotorController:
         config, n = self.config, self.config.network
         if config.initial is not None:
-            policy = load_weights(VisuomotorController, config.initial)
+            policy = load_weights(VisuomotorController, config.initial, body=config.task.body)
         else:
             policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden)
         policy.mixed_precision = True

@@ -166,16 +166,19 @@ def usable_device(device: str | torch.device) -> torch.device:
     return chosen
 
 
-def load_weights(cls: type[ModuleT], path: str | Path, device: str | torch.device = "cpu") -> ModuleT:
+def load_weights(
+    cls: type[ModuleT], path: str | Path, device: str | torch.device = "cpu", *, body: str | None = None
+) -> ModuleT:
     """Build `cls(**config)` from a record and load its weights, in evaluation mode.
 
     Args:
         cls: Class of the module; its name must be the one in the record.
         path: The `.safetensors` file; its record stands beside it.
         device: Where the module is put.
+        body: Key in `mujoban_core.bodies.BODIES` of that which the weights have to be of; any, if None.
 
     Raises:
-        WeightsError: If a file is missing or damaged (digest), or class, configuration or shapes do not fit.
+        WeightsError: If a file is missing or damaged (digest), or class, body, configuration or shapes do not fit.
     """
     path, chosen = Path(path), usable_device(device)
     check_weights_exist(path)
@@ -185,6 +188,8 @@ def load_weights(cls: type[ModuleT], path: str | Path, device: str | torch.devic
         raise WeightsError(f"{path}: damaged or not the file of its record: SHA-256 is {found}, not {record['digest']}")
     if record["class"] != cls.__name__:
         raise WeightsError(f"{path}: holds weights of {record['class']}, expected {cls.__name__}")
+    if body is not None and (found := record["config"].get("body")) != body:
+        raise WeightsError(f"{path}: weights of the body {found}, expected {body}")
     try:
         tensors = load_tensors(data)
     except (SafetensorError, ValueError, KeyError) as error:

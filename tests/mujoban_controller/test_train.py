@@ -103,6 +103,19 @@ def test_mpo_of_a_student_begins_with_the_critic_of_its_teacher(tmp_path):
         make_trainer(Options(tmp_path / "ant", replace(config, critic=tmp_path / "ant.safetensors")))
 
 
+@pytest.mark.parametrize(
+    ("stage", "option", "of"),
+    [("distil", "teacher", PrivilegedPolicy), ("ppo", "initial", PrivilegedPolicy),
+     ("asymmetric", "initial", VisuomotorController)],
+)  # fmt: skip
+def test_weights_of_another_body_are_refused_by_name(stage, option, of, tmp_path):
+    weights = of("ant")
+    file = tmp_path / "ant.safetensors"
+    save_weights(file, weights, weights.config, {})
+    with pytest.raises(WeightsError, match=r"ant\.safetensors: weights of the body ant, expected ball"):
+        make_trainer(Options(tmp_path / "run", replace(STAGES[stage], **{option: file}), evaluation_episodes=0))
+
+
 def test_the_best_product_on_validation_levels_is_exported(teacher, tmp_path):
     learner = make_trainer(Options(tmp_path, replace(STAGES["ppo"], steps=64), evaluation_episodes=2)).learner
     with torch.no_grad():
