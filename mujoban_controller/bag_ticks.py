@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_controller.controller import INPUT_FIELDS, MEMORY_FIELDS, Recurrent, VisuomotorController
-from mujoban_controller.goal_features import feature_layout, goal_offsets, privileged_features, side_ahead
+from mujoban_controller.goal_features import feature_layout, goal_offsets, looks_again, privileged_features, side_ahead
 from mujoban_controller.goal_rewards import GoalReward
 from mujoban_controller.goal_settings import GoalTaskConfig
-from mujoban_controller.goal_task import LOOK_AGAIN, Outcome
+from mujoban_controller.goal_task import Outcome
 from mujoban_controller.goal_view import StoredView
 from mujoban_controller.play import Fields, Player
 from mujoban_controller.privileged import PrivilegedPolicy
@@ -34,7 +34,7 @@ from mujoban_msgs_py.bags import Bag, BagError
 from mujoban_msgs_py.bags.training import episodes, find_bags, open_training_bag
 from mujoban_rl.engine import State
 from mujoban_rl.recordings import EndlessEpisodes
-from mujoban_sim.goals import GoalKind, GoalTracker
+from mujoban_sim.goals import GoalTracker
 from mujoban_sim.oracles import cells_of_boxes
 
 TOPICS: Final = (
@@ -91,7 +91,6 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
     rule = GoalReward(config.reward)
     there = rule.before(view.at(now, now))
     change = (applied - before)[:-1]
-    order = feature_layout(body).actuators[side]
     discount = (~failed).astype(np.float32)
     # What comes after the last tick is another episode.
     discount[-1] = 0.0
@@ -103,7 +102,7 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
         "proprio": view.proprio[:-1],
         "instruction": np.array([i.direction for i in instruction], np.int64)[:-1],
         "terminated": terminated[:-1],
-        "action": np.take_along_axis(applied, order, 1)[:-1],
+        "action": feature_layout(body).action_of(applied, side)[:-1],
         "reward": rule.after(view.at(now + 1, now), there, change, ended & completed[1:], failed),
         "discount": discount,
         "truncated": (discount == 0.0) & ~failed,
@@ -116,7 +115,7 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
 def _sides(view: StoredView, elapsed: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the side ahead at each tick, as the goal task chooses it, [L]."""
     side, ticks = side_ahead(view), np.rint(elapsed * INSTRUCTION_LIMIT).astype(np.int64)
-    again = (ticks % LOOK_AGAIN == 0) & ((ticks == 0) | (view.goals.kind != GoalKind.PUSH))
+    again = looks_again(ticks, view.goals.kind)
     since = np.maximum.accumulate(np.where(again, np.arange(len(side)), 0))
     return side[since]
 
@@ -208,13 +207,10 @@ class BagTicks(Iterator[Fields]):
         self._memory = Recurrent(*(state.part("memory").tensors[name] for name in MEMORY_FIELDS))
 
 
-@torch.inference_mode()
 def labels(teacher: PrivilegedPolicy, fields: Fields) -> NDArray[np.float32]:
     """Return the torques that a teacher would have applied in the ticks of an episode, [L - 1, U]."""
-    action = teacher(torch.from_numpy(fields["features"])).mean.clamp(-1.0, 1.0).numpy()
-    torque = np.empty_like(action)
-    np.put_along_axis(torque, feature_layout(get_body(teacher.config["body"])).actuators[fields["side"]], action, 1)
-    return torque
+    layout = feature_layout(get_body(teacher.config["body"]))
+    return layout.torque_of(teacher.act(fields["features"]), fields["side"])
 
 
 class BagPlayer(Player):

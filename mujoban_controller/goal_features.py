@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mujoban_controller.goal_view import GoalView
 from mujoban_core.bodies import Body
 from mujoban_core.grid import GRID_SIZE, INSTRUCTION_AXES, OFFSETS_XY, cell_to_xy, turn_to_instruction, xy_to_cell
+from mujoban_sim.driving import wrap_angles
 from mujoban_sim.goals import GoalKind
 
 _NEIGHBOURS = np.array([[x, y] for x in (-1, 0, 1, 2) for y in (-1, 0, 1) if (x, y) != (0, 0)], np.float64)
@@ -30,6 +31,8 @@ _NEAR = 5.0
 """Offsets are told a second time, that much larger and limited to [-1, 1]: what matters is the last tenth of a cell."""
 AWAY = 0.5
 """Cosine of the angle between the side ahead and the instruction, 60 degrees, from which on another is put ahead."""
+_LOOK_AGAIN = 30
+"""Ticks after which a robot with several fronts chooses again which one it puts ahead, unless it pushes."""
 _GRAVITY = 9.81
 BOX_FRICTION = 0.5
 """Sliding friction of a box on the floor, in every world; how far a box coasts follows from it."""
@@ -55,6 +58,16 @@ class FeatureLayout(NamedTuple):
     """Proprioception as each side sees it, [S, P]."""
     actuators: NDArray[np.int64]
     """Order of actuators as each side sees them, [S, U]."""
+
+    def torque_of(self, action: NDArray[np.float32], side: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the torques, [B, U], of actions as the sides ahead see them, [B, U]; `side` is [B]."""
+        torque = np.empty_like(action)
+        np.put_along_axis(torque, self.actuators[side], action, 1)
+        return torque
+
+    def action_of(self, torque: NDArray[np.float32], side: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return torques, [B, U], as the sides ahead see them, [B, U]; `side` is [B]."""
+        return np.take_along_axis(torque, self.actuators[side], 1)
 
 
 _FLIP_Y = (1.0, -1.0)
@@ -89,11 +102,6 @@ def feature_layout(body: Body) -> FeatureLayout:
     return FeatureLayout(start, mirror, Rearrangement(acting, acting_sign.astype(np.float32)), seen, actuators)
 
 
-def wrap(angle: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return angles in [-pi, pi)."""
-    return (np.asarray(angle, np.float64) + np.pi) % (2 * np.pi) - np.pi
-
-
 def _turn(v: NDArray[np.floating], axis: NDArray[np.float64]) -> NDArray[np.floating]:
     """Return vectors, [..., 2], in the frame whose x-axis is `axis`."""
     return np.stack(turn_to_instruction(v[..., 0], v[..., 1], axis[..., 0], axis[..., 1]), -1)
@@ -121,7 +129,17 @@ def side_ahead(world: GoalView) -> NDArray[np.int64]:
         return np.zeros(world.batch, np.int64)
     course = OFFSETS_XY[world.goals.direction]
     angle = np.where(course.any(1), np.arctan2(course[:, 1], course[:, 0]), world.pose[:, 2])
-    return np.rint(wrap(angle - world.pose[:, 2]) / (np.pi / 2)).astype(np.int64) % 4
+    return np.rint(wrap_angles(angle - world.pose[:, 2]) / (np.pi / 2)).astype(np.int64) % 4
+
+
+def looks_again(elapsed: NDArray[np.integer], kind: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return where `side_ahead` chooses anew, [B]: when an instruction is new, or has lasted for long and is no push.
+
+    Args:
+        elapsed: Ticks that the instruction in force has had, [B].
+        kind: Its `GoalKind`, [B].
+    """
+    return (elapsed == 0) | ((elapsed % _LOOK_AGAIN == 0) & (kind != GoalKind.PUSH))
 
 
 def rest_position(world: GoalView) -> NDArray[np.float64]:
@@ -160,7 +178,7 @@ def privileged_features(
     parts = [
         _posture(body, felt),
         felt[:, at.joint_velocity],
-        np.take_along_axis(torque, layout.actuators[side], 1),
+        layout.action_of(torque, side),
         felt[:, at.linear_velocity] / size,
         felt[:, at.angular_velocity],
         felt[:, at.up_axis],
@@ -190,9 +208,9 @@ def _relative_heading(
 
     A body with several fronts may stand along any axis of the grid unless it pushes.
     """
-    error = wrap(np.arctan2(along[:, 1], along[:, 0]) - heading)
+    error = wrap_angles(np.arctan2(along[:, 1], along[:, 0]) - heading)
     if world.body.symmetry.sides > 1:
-        error = np.where(world.goals.kind == GoalKind.PUSH, error, wrap(4 * error) / 4)
+        error = np.where(world.goals.kind == GoalKind.PUSH, error, wrap_angles(4 * error) / 4)
     return np.stack([np.cos(error), np.sin(error)], 1)
 
 

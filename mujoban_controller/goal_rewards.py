@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import GoalView, drift, rest_position, wrap
+from mujoban_controller.goal_features import GoalView, drift, rest_position
 from mujoban_core.grid import INSTRUCTION_AXES, OFFSETS_XY
-from mujoban_sim.driving import forward_speed
+from mujoban_sim.driving import forward_speed, wrap_angles
 from mujoban_sim.goals import GoalKind
 
 _REACH = 0.6
@@ -118,7 +118,7 @@ class GoalReward:
     def _off_course(self, world: GoalView) -> NDArray[np.float64]:
         """Return 0 where a side looks along the instruction, up to 1 halfway between two, [B]."""
         along = INSTRUCTION_AXES[world.goals.direction]
-        error = wrap(np.arctan2(along[:, 1], along[:, 0]) - world.pose[:, 2])
+        error = wrap_angles(np.arctan2(along[:, 1], along[:, 0]) - world.pose[:, 2])
         return (1.0 - np.cos(world.body.symmetry.sides * error)) / 2 * (world.goals.kind != GoalKind.HOLD)
 
 

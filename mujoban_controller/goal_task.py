@@ -20,7 +20,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import AWAY, feature_layout, goal_offsets, privileged_features, side_ahead
+from mujoban_controller.goal_features import (
+    AWAY,
+    feature_layout,
+    goal_offsets,
+    looks_again,
+    privileged_features,
+    side_ahead,
+)
 from mujoban_controller.goal_rewards import GoalReward, fallen
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.instructions import TerminationNoise, feasible_kinds, random_instruction
@@ -35,8 +42,6 @@ from mujoban_sokoban.levels import Level, LevelError
 
 EpisodeSource = Callable[[], EpisodeSpec]
 """Yields the next episode to play."""
-LOOK_AGAIN = 30
-"""Ticks after which a robot with several fronts chooses again which one it puts ahead, unless it pushes."""
 _NO_PLAN = 200
 """Ticks in a row without a plan after which a planned episode is given up: the level cannot be solved any more."""
 _ENDLESS = 2.0**62
@@ -149,7 +154,7 @@ class GoalTask:
         self._horizon = np.full(b, _ENDLESS)
         self._begin_episodes(np.arange(b))
         self._issue(np.arange(b))
-        self._turn_sides(np.arange(b))
+        self._turn_sides()
 
     @property
     def elapsed(self) -> NDArray[np.float64]:
@@ -200,9 +205,7 @@ class GoalTask:
 
     def torque_of(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the torques, [B, U], of actions in the order in which the side ahead sees them, [B, U]."""
-        torque = np.empty_like(action)
-        np.put_along_axis(torque, self._layout.actuators[self.side], action, 1)
-        return torque
+        return self._layout.torque_of(action, self.side)
 
     def observe(self, *, camera: bool = True) -> ControllerInput:
         """Return what controllers see in this tick, ground truth included; without `camera` frames are empty."""
@@ -216,7 +219,7 @@ class GoalTask:
 
     def action_of(self, torque: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return torques, [B, U], in the order in which the side ahead sees them."""
-        return np.take_along_axis(torque, self._layout.actuators[self.side], 1)
+        return self._layout.action_of(torque, self.side)
 
     def step(self, torque: NDArray[np.float32]) -> TaskStep:
         """Apply torques in [-1, 1], [B, U]; then end instructions and episodes and choose the next ones."""
@@ -246,7 +249,7 @@ class GoalTask:
             self._begin_episodes(np.flatnonzero(over))
         if rows.size:
             self._issue(rows)
-        self._turn_sides(rows)
+        self._turn_sides()
         return TaskStep(reward, (~(failed | over)).astype(np.float32), over & ~failed, outcomes, episodes)
 
     def _beyond(self, completed: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -266,11 +269,9 @@ class GoalTask:
         facing = (OFFSETS_XY[self.instruction] * np.stack([np.cos(angle), np.sin(angle)], 1)).sum(1) > AWAY
         self.side = np.where(facing, side, self.side)
 
-    def _turn_sides(self, issued: NDArray[np.int64]) -> None:
-        """Choose the side ahead where an instruction is new, or has lasted for long and is no push."""
-        elapsed = self._noise.elapsed
-        again = (elapsed > 0) & (elapsed % LOOK_AGAIN == 0) & (self.world.goals.kind != GoalKind.PUSH)
-        again[issued] = True
+    def _turn_sides(self) -> None:
+        """Choose the side ahead where it is time to."""
+        again = looks_again(self._noise.elapsed, self.world.goals.kind)
         if again.any():
             self.side = np.where(again, side_ahead(self.world), self.side)
 

@@ -82,9 +82,13 @@ class PrivilegedPolicy(GoalPolicy):
         return self._drive
 
     @torch.inference_mode()
+    def act(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the mean actions, [B, U], given features, [B, D]; in NumPy, wherever the weights are."""
+        seen = torch.from_numpy(features).to(self.log_scale.device)
+        return self(seen).mean.clamp(-1.0, 1.0).cpu().numpy()
+
     def _drive(self, task: GoalTask) -> NDArray[np.float32]:
-        action = self(torch.from_numpy(task.features())).mean.clamp(-1.0, 1.0)
-        return task.torque_of(action.numpy())
+        return task.torque_of(self.act(task.features()))
 
 
 class Value(nn.Module):

@@ -6,11 +6,9 @@ Shapes: B robots, U actuators.
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import feature_layout, privileged_features, side_ahead
-from mujoban_controller.goal_task import LOOK_AGAIN
+from mujoban_controller.goal_features import feature_layout, looks_again, privileged_features, side_ahead
 from mujoban_controller.goal_view import StoredView
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_core.bodies import get_body
@@ -45,7 +43,6 @@ class PrivilegedController(Controller):
             np.zeros((batch, 2), np.float32),
         )
 
-    @torch.inference_mode()
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques, [B, U], and the next memory."""
         *followed, elapsed, side, torque, before = state
@@ -62,11 +59,8 @@ class PrivilegedController(Controller):
             self._body, len(rows), goals, inputs.proprio, truth.pose, truth.velocity, truth.box_position, speed,
             cells_of_boxes(truth.box_position, self._body.cell_size), truth.abstract_state[..., WALL] > 0.5,
         )  # fmt: skip
-        again = fresh | ((elapsed > 0) & (elapsed % LOOK_AGAIN == 0) & (goals.kind != GoalKind.PUSH))
-        side = np.where(again, side_ahead(view), side)
+        side = np.where(looks_again(elapsed, goals.kind), side_ahead(view), side)
         features = privileged_features(view, elapsed / INSTRUCTION_LIMIT, torque, side)
-        action = self._policy(torch.from_numpy(features)).mean.clamp(-1.0, 1.0).numpy()
-        torque = np.empty_like(action)
-        np.put_along_axis(torque, self._layout.actuators[side], action, 1)
+        torque = self._layout.torque_of(self._policy.act(features), side)
         return torque, (*goals.memory(), elapsed + 1, side, torque, box.astype(np.float32))
 

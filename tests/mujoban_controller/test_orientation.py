@@ -11,6 +11,7 @@ import torch
 from mujoban_controller.controller import Recurrent, VisuomotorController
 from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
 from mujoban_controller.episodes import SeededEpisodes
+from mujoban_controller.goal_features import side_ahead
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.orientation import Compass, Sides, heading_of
@@ -50,13 +51,13 @@ def test_a_needle_goes_with_turns_and_comes_round_to_what_is_seen() -> None:
 def test_sides_are_those_of_the_goal_task() -> None:
     config = GoalTaskConfig(batch=16, body="ant", difficulty=2)
     task = GoalTask(config, OraclePlanner(), SeededEpisodes(2, 10_000_000), np.random.default_rng(0))
-    sides, rows = Sides(ANT), np.arange(16)
+    sides = Sides(ANT)
     for _ in range(40):
         task.step(np.zeros((16, ANT.action_size), np.float32))
     heading = torch.from_numpy(task.world.pose[:, 2]).float()
     facing = torch.stack([heading.cos(), heading.sin()], 1)
     side = sides.ahead(facing, torch.from_numpy(task.instruction)).numpy()
-    task._turn_sides(rows)
+    task.side = side_ahead(task.world)
     pushing = task.world.goals.kind == GoalKind.PUSH
     assert pushing.any() and np.array_equal(side[pushing], task.side[pushing])
     action = np.random.default_rng(1).normal(size=(16, ANT.action_size)).astype(np.float32)

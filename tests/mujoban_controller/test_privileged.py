@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mujoban_controller.episodes import SeededEpisodes
-from mujoban_controller.goal_features import feature_layout
+from mujoban_controller.goal_features import feature_layout, side_ahead
 from mujoban_controller.goal_settings import judging_config
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.privileged import PrivilegedPolicy
@@ -78,7 +78,7 @@ def test_an_ant_that_is_turned_by_a_quarter_puts_another_side_ahead_and_sees_the
         pose = world.pose.astype(float)
         pose[:, 2] = 0.2 + quarter * np.pi / 2
         world.place([0], pose, world.box_position)
-        task._turn_sides(np.array([0]))
+        task.side = side_ahead(world)
         seen.append(task.features()[0])
         sides.append(int(task.side[0]))
     assert sorted(sides) == [0, 1, 2, 3]
