@@ -1,8 +1,8 @@
 """The ant body: a torso on four legs with eight degrees of freedom, in a world three times as large (paper A.3).
 
-Geometry as in Gymnasium's ``Ant``, 7.3 kg: with its density of 5 it is too light to push a box. Servos hold the joints:
-with plain torques it learns slower. Its legs pass through each other. Legs are numbered counter-clockwise, the first at
-the front on the left.
+Geometry as in Gymnasium's ``Ant``, 6.0 kg: with its density of 5 it is too light to push a box. The limbs from torso
+to hips are drawn alone: they weigh nothing and touch nothing. Servos hold the joints: with plain torques it learns
+slower. Its legs pass through each other. Legs are numbered counter-clockwise, the first at the front on the left.
 """
 
 from __future__ import annotations

@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mujoco.batch import Batch
 
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import ANT, BALL
+from mujoban_core.bodies.body import ROBOT_BODY
 from mujoban_core.grid import cell_to_xy
 from mujoban_sim.presets import EASED, REFERENCE, WORLDS, get_world
 from mujoban_sim.scene import (
@@ -64,6 +65,14 @@ def test_the_control_period_is_50_ms(name):
 def test_an_unknown_world_is_named():
     with pytest.raises(ValueError, match=r"'moon'.*reference, eased"):
         get_world("moon")
+
+
+@pytest.mark.parametrize(
+    ("body", "world", "kilograms"), [(BALL, EASED, 21.0), (BALL, REFERENCE, 22.0), (ANT, REFERENCE, 6.0)]
+)
+def test_robots_weigh_what_the_guide_says(body, world, kilograms):
+    model = mujoco.MjModel.from_xml_string(scene_mjcf(np.zeros((10, 10), bool), 1, body, world))
+    assert model.body(ROBOT_BODY).subtreemass[0] == pytest.approx(kilograms, abs=0.3)
 
 
 def test_boxes_weigh_25_kg_and_never_turn():
