@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mujoban_controller.controller import INPUT_FIELDS, MEMORY_FIELDS, Recurrent, VisuomotorController
 from mujoban_controller.goal_features import feature_layout, goal_offsets, looks_again, privileged_features, side_ahead
-from mujoban_controller.goal_rewards import GoalReward
+from mujoban_controller.goal_rewards import GoalReward, fallen
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import Outcome
 from mujoban_controller.goal_view import StoredView
@@ -56,6 +56,9 @@ TOPICS: Final = (
 def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fields:
     """Return the fields of MPO's replay for all but the last tick of an episode, [L - 1, ...].
 
+    An episode ends where the robot falls, as in the goal task. A push beyond its target goes on, as in the bag, until
+    its instruction ends.
+
     Args:
         ticks: As `episodes` yields them.
         config: Rewards and body.
@@ -82,7 +85,8 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
     )  # fmt: skip
     now = np.arange(len(ticks) - 1)
     ended = np.array([t.terminated for t in said])[1:]
-    failed = ended & ~completed[1:] & np.array([t.timed_out for t in said])[1:]
+    lying = fallen(view)[1:]
+    failed = (ended & ~completed[1:] & np.array([t.timed_out for t in said])[1:]) | lying
     terminated = np.array([t.terminated for t in said])
     terminated[0] = False
     applied = np.stack(torque).astype(np.float32)
@@ -92,9 +96,10 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
     there = rule.before(view.at(now, now))
     change = (applied - before)[:-1]
     discount = (~failed).astype(np.float32)
+    last = int(lying.argmax()) if lying.any() else len(now) - 1
     # What comes after the last tick is another episode.
-    discount[-1] = 0.0
-    return {
+    discount[last] = 0.0
+    fields = {
         "features": privileged_features(view, elapsed, before, side)[:-1],
         "side": side[:-1],
         "first": now == 0,
@@ -110,6 +115,7 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
         "kind": goals.kind[:-1].copy(),
         "heading": view.pose[:-1, 2].copy(),
     }
+    return {name: values[: last + 1] for name, values in fields.items()}
 
 
 def _sides(view: StoredView, elapsed: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -102,6 +102,19 @@ def test_the_transitions_are_those_of_the_goal_task(recorded):
         np.testing.assert_allclose(found[name], live[name], atol=1e-4, err_msg=name)
 
 
+def test_an_episode_ends_where_the_robot_falls_and_costs_a_fall_once(recorded):
+    (ticks,) = episodes(open_training_bag(recorded[0] / "row000", TOPICS), TOPICS)
+    proprio = TOPICS.index(topics.PROPRIO)
+    for tick in range(40, len(ticks)):
+        lying = ticks[tick][proprio].copy()
+        lying[BALL.proprio.up_axis] = 1.0, 0.0, 0.0
+        ticks[tick] = (*ticks[tick][:proprio], lying, *ticks[tick][proprio + 1 :])
+    found = transitions(ticks, CONFIG)
+    assert {len(values) for values in found.values()} == {40}
+    assert found["reward"][-1] == CONFIG.reward.fallen and (found["reward"][:-1] > CONFIG.reward.fallen).all()
+    assert found["discount"][-1] == 0.0 and not found["truncated"][-1] and found["discount"][:-1].all()
+
+
 def test_rows_go_on_from_episode_to_episode_and_know_the_policys_memory(recorded):
     path, live = recorded
     torch.manual_seed(0)
