@@ -67,6 +67,8 @@ class Outcome(NamedTuple):
     """Whether the pushed box stands across its lane by more than the tolerance."""
     wrong_cell: bool
     """Whether robot or boxes are in cells to which the instruction does not lead."""
+    fallen: bool
+    """Whether the robot lies on its side or back."""
 
 
 class EpisodeEnd(NamedTuple):
@@ -323,6 +325,7 @@ class GoalTask:
             int(self._noise.elapsed[row]),
             kind == GoalKind.PUSH and bool(across > self.config.tolerance),
             astray,
+            bool(fallen(world)[row]),
         )
 
     def _begin_episodes(self, rows: NDArray[np.int64]) -> None:

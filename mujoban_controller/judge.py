@@ -33,7 +33,9 @@ def kind_name(outcome: Outcome) -> str:
 
 
 def failure_name(outcome: Outcome) -> str:
-    """Return why an instruction failed: the box left its lane, someone is in a wrong cell, or time ran out."""
+    """Return why an instruction failed: robot fallen, box off its lane, someone in a wrong cell, or time run out."""
+    if outcome.fallen:
+        return "fallen"
     if outcome.off_lane:
         return "box off lane"
     return "wrong cell" if outcome.wrong_cell else "time-out"

@@ -13,7 +13,7 @@ from mujoban_controller.goal_features import feature_layout
 from mujoban_controller.goal_settings import GoalTaskConfig, judging_config
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.instructions import EXACT
-from mujoban_controller.judge import judge
+from mujoban_controller.judge import failure_name, judge
 from mujoban_controller.scripted import scripted_driver
 from mujoban_core.bodies import BALL
 from mujoban_core.grid import OFFSETS_XY, Instruction
@@ -70,6 +70,15 @@ def test_an_idle_robot_fails_moves_after_the_limit_and_is_given_up_after_some():
     assert len(failures[1][1].episodes) == 4
     assert task.first.all()
     assert not task.terminated.any()
+
+
+def test_a_fall_ends_the_episode_and_is_named_as_the_cause(monkeypatch):
+    task = make(planned=1.0, astray=0.0, misaligned=0.0, horizon=np.inf)
+    play(task, 5, idle)
+    monkeypatch.setattr("mujoban_controller.goal_task.fallen", lambda world: np.arange(world.batch) == 1)
+    (result,) = play(task, 1, idle)
+    assert [(o.row, o.completed, failure_name(o)) for o in result.outcomes] == [(1, False, "fallen")]
+    assert [e.row for e in result.episodes] == [1] and result.discount.tolist() == [1.0, 0.0, 1.0, 1.0]
 
 
 def test_the_signal_comes_with_the_next_instruction_and_says_what_the_rule_said():
