@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import BALL, get_body
 from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
 from mujoban_core.plugins import (
     AGENT,
@@ -86,7 +86,8 @@ class Stack:
     choices: dict[str, Choice] = field(default_factory=lambda: {role: Choice(role) for role in ROLES})
     device: str = "cpu"
     look_around: int | None = None
-    """Ticks of looking around at the start of an episode; None: `LOOK_AROUND_TICKS`, or 0 for the oracle estimator."""
+    """Ticks of looking around at the start of an episode; None: `LOOK_AROUND_TICKS`, or 0 for the oracle estimator and
+    for a body that cannot turn on the spot."""
     look_ahead: int = 0
     """Evaluations of the planner's tree search; 0 for none."""
     threads: int = 1
@@ -102,7 +103,8 @@ class Stack:
         """Ticks of looking around at the start of an episode."""
         if self.look_around is not None:
             return self.look_around
-        return 0 if self.choices["estimator"].source == ORACLE else LOOK_AROUND_TICKS
+        blind = self.choices["estimator"].source != ORACLE
+        return LOOK_AROUND_TICKS if blind and get_body(self.body).turn is not None else 0
 
     def policy(self) -> SensePlanAct:
         """Return the modules composed into one policy.
@@ -122,7 +124,8 @@ class Stack:
             modules["planner"] = look_ahead(modules["planner"], self.look_ahead)
         ticks = self.look_around_ticks
         scout = load_scout(self.scout.source, self.scout.weights, self.device) if ticks else None
-        looking = {role: look_around(module, ticks, scout) for role, module in modules.items()}
+        body = get_body(self.body)
+        looking = {role: look_around(module, ticks, scout, body) for role, module in modules.items()}
         return SensePlanAct(**looking)  # pyright: ignore
 
     def identities(self) -> dict[str, str]:

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import BALL, Body
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
 from mujoban_core.interfaces import (
     Controller,
@@ -31,7 +32,7 @@ from mujoban_core.interfaces import (
 from mujoban_core.visibility import cells_in_view
 
 LOOK_AROUND_TICKS: Final = 40
-"""Ticks in which the ball turns once at `_TURN`; what a learned estimator gets by default."""
+"""Ticks in which the ball turns once; what a learned estimator gets by default."""
 LOOKING_ROLES: Final = ("planner", "controller")
 """The roles that `look_around` wraps."""
 WALKS: Final = 30
@@ -48,10 +49,6 @@ _WALK_COST: Final = 0.5
 """Cells of gain that one step of the way is worth."""
 TURN_HEADINGS: Final = 0.4 * math.pi * np.arange(5)
 """Views that together make a turn, given the camera's 80 degrees."""
-_TURN: Final = 0.7
-"""Torque of the turn."""
-_STEER: Final = 1
-"""Actuator that turns the body."""
 _CELLS: Final = GRID_SIZE * GRID_SIZE
 
 AnyModule = TypeVar("AnyModule", bound=Module)
@@ -151,10 +148,11 @@ class LookAroundPlanner(Planner):
 class LookAroundController(Controller):
     """Turns on the spot where the robot is to STAY; else does what another controller does, whose memory it keeps."""
 
-    def __init__(self, inner: Controller) -> None:
-        """Wrap `inner`."""
+    def __init__(self, inner: Controller, turn: Sequence[float]) -> None:
+        """Wrap `inner`; `turn` is the action, U values, that turns the robot on the spot."""
         self.inner = inner
         self.privileged = inner.privileged
+        self._turn = np.array(turn, np.float32)
 
     def initial_memory(self, batch: int) -> Memory:
         """Return the other controller's memory at the start of `batch` episodes."""
@@ -163,25 +161,27 @@ class LookAroundController(Controller):
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques, [B, U], and the next memory; the other controller sees every tick."""
         torque, memory = self.inner.step(inputs, state)
-        turn = np.zeros_like(torque)
-        turn[:, _STEER] = _TURN
-        return np.where((inputs.instruction == int(Instruction.STAY))[:, None], turn, torque), memory
+        return np.where((inputs.instruction == int(Instruction.STAY))[:, None], self._turn, torque), memory
 
 
 def look_around(
-    module: AnyModule, ticks: int, scout: Scout | None = None
+    module: AnyModule, ticks: int, scout: Scout | None = None, body: Body = BALL
 ) -> AnyModule | LookAroundPlanner | LookAroundController:
     """Return a planner or controller that looks around, `ticks` a look; 0, or another module: itself.
 
     Raises:
-        ValueError: If `ticks` is negative.
+        ValueError: If `ticks` is negative, or the body has no action that turns it on the spot.
     """
     if ticks < 0:
         raise ValueError(f"look_around {ticks}: expected a number of ticks, 0 for none")
-    if ticks and isinstance(module, Planner):
+    if ticks == 0:
+        return module
+    if body.turn is None:
+        raise ValueError(f"look_around {ticks}: the {body.name} has no action that turns it on the spot; expected 0")
+    if isinstance(module, Planner):
         return LookAroundPlanner(module, ticks, scout=scout)
-    if ticks and isinstance(module, Controller):
-        return LookAroundController(module)
+    if isinstance(module, Controller):
+        return LookAroundController(module, body.turn)
     return module
 
 

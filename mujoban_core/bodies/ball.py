@@ -49,4 +49,5 @@ BALL: Final = Body(
     time_limit=TIME_LIMIT,
     camera=_CAMERA,
     mjcf=_MJCF,
+    turn=(0.0, 0.7),
 )

@@ -191,6 +191,7 @@ class Body:
         camera: how the body carries its first-person camera.
         mjcf: the ``<body>`` element, with the camera `FIRST_PERSON_CAMERA` and the site ``imu``; the figures of
             `RobotPhysics` stand in braces, for `fragment` to fill in.
+        turn: the action, U values in [-1, 1], that turns it to its left on the spot; None where no single one does.
     """
 
     name: str
@@ -206,6 +207,7 @@ class Body:
     time_limit: int
     camera: CameraMount
     mjcf: str
+    turn: tuple[float, ...] | None = None
 
     @property
     def action_size(self) -> int:

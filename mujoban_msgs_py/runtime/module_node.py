@@ -14,6 +14,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 
+from mujoban_core.bodies import BALL, get_body
 from mujoban_core.interfaces import GroundTruth, Module, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
 from mujoban_core.plugins import LEARNED, PRIVILEGED, check_body, load_module
@@ -155,7 +156,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         if self._body:
             check_body(self.role, module, self._body)
         # `load_module` has checked that it is of the role.
-        return cast(ModuleT, look_around(self.prepare(module), self._look_around, self.scout))
+        body = get_body(self._body) if self._body else BALL
+        return cast(ModuleT, look_around(self.prepare(module), self._look_around, self.scout, body))
 
     @property
     def scout(self) -> Scout | None:

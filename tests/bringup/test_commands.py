@@ -20,7 +20,6 @@ from bringup.command import Stack, recorded_seed
 from bringup.options import EpisodeOptions
 from bringup.reporting import Reporting, played
 from mujoban_core.files import digest
-from mujoban_core.look_around import LOOK_AROUND_TICKS
 from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import open_bag
@@ -96,7 +95,7 @@ def test_a_report_says_what_was_played(tmp_path):
     assert json.loads(path.read_text())["played"] == {**game, **filed, "look_around": 0, "realtime": 9.0}
     searching = Stack(look_ahead=400, body="ant")
     told = played(searching, Episodes(1, 0), EpisodeOptions(body="ant"))
-    assert told["look_ahead"] == 400 and told["look_around"] == LOOK_AROUND_TICKS and told["time_limit"] == 9600
+    assert told["look_ahead"] == 400 and told["look_around"] == 0 and told["time_limit"] == 9600
 
 
 def test_a_summary_on_the_terminal_names_lost_seeds_by_cause(capfd):

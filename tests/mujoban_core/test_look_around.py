@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
 
+from bringup.command import Stack
 from bringup.rollout import ticks
+from mujoban_core.bodies import ANT
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
 from mujoban_core.look_around import LOOK_AROUND_TICKS, LookAroundPlanner, look_around, step_to_view
 from mujoban_core.sense_plan_act import SensePlanAct
@@ -82,6 +84,13 @@ def test_looks_come_to_an_end():
         instructions.append(int(instruction[0]))
     assert instructions[:2] == [0, 0]
     assert now.memory[-2][0] == 0
+
+
+def test_a_body_that_cannot_turn_on_the_spot_is_refused_and_does_not_look_around_by_default():
+    for part in (OraclePlanner(), OracleController()):
+        with pytest.raises(ValueError, match="the ant has no action that turns it on the spot; expected 0"):
+            look_around(part, 40, body=ANT)
+    assert (Stack(body="ant").look_around_ticks, Stack().look_around_ticks) == (0, LOOK_AROUND_TICKS)
 
 
 def test_a_negative_time_is_refused():
