@@ -1,13 +1,17 @@
-"""Rebuild every table and figure in docs/results/ from the JSON of the evaluations: `make results`."""
+"""Rebuild every table and figure in docs/results/ from the JSON of the evaluations: `make results`.
+
+``python -m benchmarks.paper --check`` only says whether the page is up to date.
+"""
 
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
-from benchmarks.command import run_benchmark
 from benchmarks.paper import bodies, curves, figures, film, tables
 from benchmarks.paper.runs import (
     ALL,
@@ -21,6 +25,7 @@ from benchmarks.paper.runs import (
     Run,
     is_stale,
 )
+from mujoban_core.program import read_options, run_command
 from mujoban_sim.rendering import RenderingError
 
 INTRODUCTION = f"""# Results
@@ -47,21 +52,26 @@ TABLE_2 = """Each configuration replaces modules by oracles.
 """
 
 
+PAGE: Final = "README.md"
+PROG: Final = "benchmarks.paper"
+
+
 @dataclass(frozen=True)
 class Options:
     """Options of the command."""
 
     out: Path = RESULTS
     """Folder of the page and its figures."""
+    check: bool = False
+    """Only say whether the page there is up to date, with status 1 if it is not."""
 
 
-def rebuild(options: Options) -> str:
-    """Write README.md and the figures; return the path of the page.
+def rebuild(folder: Path) -> Path:
+    """Write the page and its figures into a folder; return the path of the page.
 
     Raises:
         ResultError: If a source is damaged.
     """
-    folder = options.out
     folder.mkdir(parents=True, exist_ok=True)
     sections = [
         INTRODUCTION,
@@ -94,9 +104,16 @@ def rebuild(options: Options) -> str:
         tables.test_uses(bodies.RUNS),
         *_figure_5(folder),
     ]
-    page = folder / "README.md"
+    page = folder / PAGE
     page.write_text("\n".join(sections))
-    return str(page)
+    return page
+
+
+def is_current(folder: Path) -> bool:
+    """Tell whether the text of a folder's page is what the sources say; its figures may differ with the libraries."""
+    page = folder / PAGE
+    with tempfile.TemporaryDirectory() as place:
+        return page.is_file() and page.read_text() == rebuild(Path(place)).read_text()
 
 
 def _figure_2(runs: Sequence[Run], folder: Path) -> list[str]:
@@ -150,5 +167,17 @@ def _missing(what: str, command: str) -> list[str]:
     return [f"{what}: not measured yet (`{command}`).\n"]
 
 
+def main(command_line: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    options = read_options(Options, command_line, PROG, __doc__)
+    if not options.check:
+        print(rebuild(options.out))
+        return 0
+    current = is_current(options.out)
+    if not current:
+        print(f"{options.out / PAGE} is not up to date")
+    return int(not current)
+
+
 if __name__ == "__main__":
-    run_benchmark("benchmarks.paper", Options, rebuild, __doc__)
+    run_command(PROG, main)

@@ -1,7 +1,6 @@
 """Tables and figures of the paper: rebuilt from JSON, marked when stale, missing sources named with their command."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -31,7 +30,7 @@ def write(run, solved, of, weights):
 
 
 def test_without_sources_the_page_names_the_commands_that_make_them(folder, capsys):
-    assert results.rebuild(results.Options(folder)) == str(folder / "README.md")
+    assert results.rebuild(folder) == folder / "README.md"
     page = (folder / "README.md").read_text()
     assert "python -m benchmarks.paper.runs --only film_strip" in page
     assert "python -m benchmarks.paper.curves --controller RUN" in page
@@ -41,11 +40,25 @@ def test_without_sources_the_page_names_the_commands_that_make_them(folder, caps
     assert "no source yet" in capsys.readouterr().err
 
 
+def test_the_page_in_the_repository_is_what_its_sources_say(monkeypatch):
+    monkeypatch.setattr(film, "draw", lambda episode, file: None)  # Pictures may differ.
+    assert results.is_current(runs.RESULTS), "run: make results"
+
+
+def test_a_page_that_was_edited_or_is_missing_is_noticed(folder, capsys):
+    check = ["--out", str(folder), "--check"]
+    assert results.main(check) == 1 and results.main(check[:2]) == 0 and results.main(check) == 0
+    (folder / "README.md").write_text((folder / "README.md").read_text().replace("78.7 %", "8.7 %"))
+    assert results.main(check) == 1
+    assert f"{folder / 'README.md'} is not up to date" in capsys.readouterr().out
+    assert "8.7 %" in (folder / "README.md").read_text()
+
+
 def test_the_page_has_our_numbers_beside_the_papers_and_marks_other_weights(folder):
     shipped = {role: digest(shipped_weights(role)) for role in ROLES}
     write(runs.CONFIGURATIONS[0], 3, 4, shipped)
     write(runs.CONFIGURATIONS[2], 4, 4, {**shipped, "controller": "0" * 64})
-    assert results.rebuild(results.Options(folder)) == str(folder / "README.md")
+    assert results.rebuild(folder) == folder / "README.md"
     page = (folder / "README.md").read_text()
     assert "| default | `default` | none | 4 | 75.0 % | 30.1 to 95.4 % | 78.7 % | 11.25 (2.75) | 11.42 |" in page
     assert f"| controller only{tables.STALE} | `controller` |" in page and (folder / "figure2.png").stat().st_size
@@ -64,7 +77,7 @@ def test_levels_that_end_otherwise_through_the_graph_are_named(folder):
 def test_a_damaged_source_is_named_with_the_command_that_mends_it(folder):
     runs.CONFIGURATIONS[0].file.write_text("{}")
     with pytest.raises(runs.ResultError, match=r"default\.json.*python -m benchmarks\.paper\.runs --only default"):
-        results.rebuild(results.Options(folder))
+        results.rebuild(folder)
 
 
 def test_the_film_strip_plays_the_recorded_episode_again(folder):
@@ -147,7 +160,7 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
     cost = {"step": 10_000, "cpu_seconds": 3600}
     assert baselines.points_of(row)[-1] == {**cost, "solved": {"1": 1.0}, "return": {"1": 10.0}}
     write(row.run(1), 3, 4, {"agent": "a" * 64})
-    page = Path(results.rebuild(results.Options(folder))).read_text()
+    page = results.rebuild(folder).read_text()
     rates = "75.0 % (30.1 to 95.4) | - | - | - | -"
     assert f"| MPO, asym. | o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 4 | {rates} |" in page
     assert (folder / "baselines.png").stat().st_size and "--agent" in row.run(1).options()
@@ -155,7 +168,7 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
         baselines.main(["nobody=x"])
     row.curve.write_text("{}\n")
     with pytest.raises(runs.ResultError, match=r"rerun python -m benchmarks\.paper\.baselines mpo_easy"):
-        results.rebuild(results.Options(folder))
+        results.rebuild(folder)
 
 
 @pytest.fixture
@@ -215,7 +228,7 @@ def test_figure_5_has_both_bodies_and_marks_a_controller_that_is_another_now(fol
     ant = bodies.BODIES["ant"]
     write(ant[4], 3, 4, {**shipped, "controller": f"{digest(ant[4].controller)} (privileged)"})
     write(ant[3], 4, 4, {**shipped, "controller": f"{'0' * 64} (privileged)"})
-    assert results.rebuild(results.Options(folder)) == str(folder / "README.md")
+    assert results.rebuild(folder) == folder / "README.md"
     page = (folder / "README.md").read_text()
     assert "| ant, by ground truth (privileged), difficulty 5 | `ant_5` |" in page and "| 73.7 % |" in page
     assert f"| ant, by ground truth (privileged), difficulty 4{tables.STALE} | `ant_4` |" in page
