@@ -16,10 +16,12 @@ from bringup import model_card
 from bringup.model_card import Place, Score
 from mujoban_core.files import write_atomically
 from mujoban_core.program import read_options, run_command
+from mujoban_sim.presets import DEFAULT_WORLD
 
 CARDS: Final = ROOT / "docs" / "models"
 _PLACE: Final = Place(
-    "python -m benchmarks.model_cards", "../", "levels that no training saw ([results](../results/README.md))"
+    "python -m benchmarks.model_cards", "../",
+    f"levels that no training saw, in the {DEFAULT_WORLD} world ([results](../results/README.md))",
 )
 
 

@@ -145,6 +145,8 @@ def _weights(record: Mapping[str, Any], weights: str) -> list[tuple[str, str]]:
 def _training(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     data = record.get("data", "")
     rows = [("data", ", ".join(data) if isinstance(data, list) else str(data))]
+    if record.get("world"):
+        rows.append(("world", f"`{record['world']}`"))
     if record.get("bags"):
         bags = record["bags"]
         rows.append(("bags", str(bags if isinstance(bags, int) else len(bags))))

@@ -26,6 +26,7 @@ from benchmarks.paper.runs import (
     is_stale,
 )
 from mujoban_core.program import read_options, run_command
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.rendering import RenderingError
 
 INTRODUCTION = f"""# Results
@@ -36,10 +37,15 @@ INTRODUCTION = f"""# Results
     python -m benchmarks.paper.runs --only NAME        # one row, by the name in its table, or film_strip
     python -m benchmarks.paper.curves --help           # learning curves from the run directories of trainers
 
+Rows are of the *{DEFAULT_WORLD}* world unless a section says otherwise: walls half as high as the paper's and boxes
+with slippery sides make it easier to see, to push and to steer ([worlds](../world.md#two-worlds)). The paper's numbers
+beside them are of the paper's world.
+
 Rows run `bringup/evaluate.py` on n levels of the generator with the seeds {SEED} to {SEED} + n - 1, never used in
-training (paper: n = 512). Intervals are 95 % Wilson intervals of the success rate, s.e. is the standard error. A row
-marked † was measured with other weights than those that ship now; the JSON has the digests of its weights, and every
-episode.
+training (paper: n = 512). They are not free of choice: before validation levels were set apart, rules, constants and
+successive weights were compared on them ([levels](../levels.md#the-five-difficulties)). Intervals are 95 % Wilson
+intervals of the success rate, s.e. is the standard error. A row marked † was measured with other weights than those
+that ship now; the JSON has the digests of its weights, and every episode.
 """
 TABLE_1 = """The agents that modular RL is compared with ([how each is trained](../baselines.md)). The
 paper trained each for weeks with 256 to 1,000 actors, and reports the best of many settings; here steps and CPU hours

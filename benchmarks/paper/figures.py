@@ -20,6 +20,7 @@ from benchmarks.paper.baselines import BASELINES, points_of
 from benchmarks.paper.curves import MODULES
 from benchmarks.paper.runs import ResultError, Run, is_stale, load
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_sim.presets import DEFAULT_WORLD
 
 _COLUMNS: Final = 4
 _VARIANTS: Final = {"mpo": "MPO alone, from nothing"}
@@ -32,7 +33,10 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
     if not reports:
         return False
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
-    for stale, label in ((False, "Mujoban, fully learned"), (True, "the same with other weights than ship now")):
+    for stale, label in (
+        (False, f"Mujoban, fully learned, {DEFAULT_WORLD} world"),
+        (True, "the same with other weights than ship now"),
+    ):
         chosen = [(run, report) for run, report in reports if is_stale(report) == stale]
         if chosen:
             x = [run.difficulty for run, _ in chosen]
@@ -52,7 +56,7 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
             axes.errorbar(x, rates, yerr=bars, capsize=2, marker=".", linewidth=1, label=label)
     paper = [(run.difficulty, run.paper_success) for run, _ in reports if run.paper_success is not None]
     if paper:
-        axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, Table 1", zorder=3)
+        axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, its world", zorder=3)
     save_rates(figure, axes, file)
     return True
 

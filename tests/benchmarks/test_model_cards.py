@@ -26,3 +26,10 @@ def test_weights_that_nobody_described_are_named(tmp_path, monkeypatch):
     (tmp_path / "new.json").write_text(json.dumps({"class": "Mystery"}))
     with pytest.raises(CardError, match=r"new\.json: no text about Mystery"):
         model_cards.card(tmp_path / "new.json")
+
+
+def test_a_card_says_in_which_world_its_weights_were_trained():
+    for path in model_cards.records():
+        record = json.loads(path.read_text())
+        if record["class"] != "ResidualPlanner":  # which learned from boards alone
+            assert f"| world | `{record['world']}` |" in model_cards.card(path), path
