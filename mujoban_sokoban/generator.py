@@ -24,7 +24,7 @@ from mujoban_sokoban.bitboard import NONE, SIDE, SQUARES, Bits, Int, bit, count,
 from mujoban_sokoban.levels import Level, LevelBatch
 
 TEST_SEEDS: Final = range(0, 5_000_000)
-"""Seeds of results, and of what users play. Nothing is tuned on them, and each evaluation on them is logged."""
+"""Seeds of results, and of what users play: never of training, and for tuning there are others."""
 VALIDATION_SEEDS: Final = range(5_000_000, 10_000_000)
 """Seeds for tuning: to be looked at as often as one likes."""
 TRAIN_SEEDS: Final = range(10_000_000, 2**62)

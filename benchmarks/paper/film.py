@@ -1,6 +1,6 @@
 """Figure 3: an episode that the learned modules solved, as a film strip (paper Fig. 3).
 
-`record` plays unseen levels until one is solved and keeps the episode as JSON: its seed, the torques, the instructions
+`record` plays test levels until one is solved and keeps the episode as JSON: its seed, the torques, the instructions
 and the digests of the weights. Physics is deterministic, so `draw` plays the torques again, without any network, and
 draws frames where it likes.
 """

@@ -23,7 +23,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 RESULTS: Final = ROOT / "docs" / "results"
 JSON: Final = RESULTS / "json"
 SEED: Final = 1000
-"""Seed of the first of the 512 unseen levels (paper C.5); a test seed, like all that a user types."""
+"""Seed of the first of the 512 levels that no training saw (paper C.5); a test seed, like all that a user types."""
 EPISODES: Final = 512
 """Levels of an evaluation (paper C.5)."""
 DIGEST_LENGTH: Final = 64
