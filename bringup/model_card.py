@@ -12,6 +12,8 @@ from typing import Any, Final, NamedTuple
 from mujoban_core.text import readable
 
 _WIDTH: Final = 112
+_NAMED_TEACHERS: Final = ("scripted driver",)
+"""What a record's `teacher` may be beside a digest."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +24,16 @@ class Purpose:
     does: str
     sees: str
     limits: str
+    beside: str
+    """Rules that no training changes and that decide with the network, or what they prepare for it."""
+    learned: Mapping[str, str]
+    """How it learned, by what `_ways` reads in the record."""
     guide: str
     """Page in docs/."""
+
+    def how(self, record: Mapping[str, Any]) -> str:
+        """Return how the weights of a record learned."""
+        return "; then ".join(self.learned.get(way, f"by {way}") for way in _ways(record))
 
 
 _GRID_LIMITS: Final = "levels of up to 10 x 10 cells that look like the generator's; warehouses drawn by this renderer"
@@ -34,6 +44,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "Estimates the probability of wall, target, agent and box in each of the 10 x 10 cells (paper C.1).",
         "The camera frame and the robot's own pose, from the episode's start on. No ground truth.",
         f"Cells never in view are guesses. Made for {_GRID_LIMITS}.",
+        "its attention starts from the camera's known geometry",
+        {"": "supervised, by the ground truth in recorded bags"},
         "estimator",
     ),
     "ControlTermination": Purpose(
@@ -42,6 +54,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "The camera frame, proprioception, the instruction and its own last answer. No pose, no ground truth.",
         "Relies on dead reckoning: a robot that slips for long, or is moved, misleads it. Knows no box that it "
         "does not see.",
+        "the completion is declared after 120 ticks; dead reckoning and the instruction's frame feed it",
+        {"": "supervised, by the rule of completion in recorded bags"},
         "estimator",
     ),
     "PrivilegedPolicy": Purpose(
@@ -50,6 +64,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "goal task's rewards alone (paper C.3).",
         "The robot's pose and velocity, the boxes' positions, proprioception and the instruction: ground truth.",
         "Not for a robot that has only a camera. Made for the world that its record names.",
+        "none",
+        {"teacher": "by reward alone, in the goal task"},
         "controller",
     ),
     "ResidualPlanner": Purpose(
@@ -58,6 +74,13 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "The estimate of the abstract state and its own decisions of the episode. No camera, no ground truth.",
         "Solves most levels, not all: what it loses ends nearly always in a state that only search proves dead. Boards "
         "of 8 x 8 inner cells; more than four boxes were not trained on.",
+        "what was tried loses attraction; verdicts on pushes are weighed by a constant, and before a push called "
+        "deadly it stays and looks again; a fixed recursion by the rules of Sokoban tells what can be reached and the way to "
+        "a push; a rule says where to look before each decision, for up to 30 instructions",
+        {
+            "imitation": "supervised, by an optimal solver, also on its own play",
+            "expert-iteration": "by its own play and search, without a solver",
+        },
         "planner",
     ),
     "VisuomotorController": Purpose(
@@ -65,6 +88,12 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "Turns an instruction into motor torques (paper C.3).",
         "The camera frame, proprioception, the instruction and the termination signal. No pose, no ground truth.",
         "One body and the physics that it was trained in. A box that rests against pegs off its lane is lost to it.",
+        "turns on the spot while the robot looks around; angles and dead reckoning feed it",
+        {
+            "scripted driver": "supervised, by a scripted driver that knows the truth, on its own play",
+            "distil": "supervised, by a teacher that knows the truth, on its own play",
+            "mpo": "by reward, with a critic that knows the truth",
+        },
         "controller",
     ),
 }
@@ -117,6 +146,7 @@ def card(path: Path, file: str, place: Place, scores: Sequence[Score] = ()) -> s
         f"Generated from the weights' record by `{place.made_by}`; do not edit.",
         purpose.does,
         f"- **May see:** {purpose.sees}\n- **Limits:** {purpose.limits}\n"
+        f"- **Learned:** {purpose.how(record)}.\n- **Rules beside it:** {purpose.beside}.\n"
         f"- **How it works and is trained:** {_guide(purpose.guide, place.docs)}",
         "## Weights\n\n" + _table(("what", "value"), _weights(record, file)),
         "## Training\n\n" + _table(("what", "value"), _training(record)),
@@ -126,6 +156,13 @@ def card(path: Path, file: str, place: Place, scores: Sequence[Score] = ()) -> s
         "## Configuration\n\n" + _table(("setting", "value"), _settings(record)),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _ways(record: Mapping[str, Any]) -> list[str]:
+    """Return what a record says of how its weights learned: a teacher that is no network, methods or the stage."""
+    if record.get("teacher") in _NAMED_TEACHERS:
+        return [record["teacher"]]
+    return str(record.get("method") or record["training"].get("stage") or "").split(" then ")
 
 
 def _guide(page: str, docs: str | None) -> str:

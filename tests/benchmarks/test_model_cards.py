@@ -1,12 +1,13 @@
 """Model cards say what the records of the shipped weights say."""
 
 import json
+import re
 import shutil
 
 import pytest
 
 from benchmarks import model_cards
-from bringup.model_card import CardError
+from bringup.model_card import PURPOSES, CardError
 
 
 def test_the_cards_are_up_to_date():
@@ -33,3 +34,27 @@ def test_a_card_says_in_which_world_its_weights_were_trained():
         record = json.loads(path.read_text())
         if record["class"] != "ResidualPlanner":  # which learned from boards alone
             assert f"| world | `{record['world']}` |" in model_cards.card(path), path
+
+
+def test_the_readme_tells_of_each_module_how_it_learned_and_which_rules_stand_beside_it():
+    readme = (model_cards.ROOT / "README.md").read_text()
+    told = {name: cells for name, *cells in re.findall(r"docs/models/(\w+)\.md\) \| (.*) \| (.*) \|", readme)}
+    assert told.keys() == {"estimator", "termination", "planner", "controller_ball"}
+    for path in model_cards.records():
+        if path.stem in told:
+            record = json.loads(path.read_text())
+            purpose = PURPOSES[record["class"]]
+            assert told[path.stem] == [purpose.how(record), purpose.beside]
+
+
+@pytest.mark.parametrize(
+    ("class_name", "record", "how"),
+    [
+        ("VisuomotorController", {"teacher": "a" * 64, "training": {"stage": "distil"}}, "by a teacher that knows"),
+        ("VisuomotorController", {"teacher": "scripted driver", "training": {"stage": "distil"}}, "scripted driver"),
+        ("VisuomotorController", {"teacher": None, "training": {"stage": "mpo"}}, "by reward"),
+        ("ResidualPlanner", {"method": "expert-iteration then ppo", "training": {}}, "without a solver; then by ppo"),
+    ],
+)
+def test_how_weights_learned_is_what_their_own_record_says(class_name, record, how):
+    assert how in PURPOSES[class_name].how(record)
