@@ -150,7 +150,8 @@ def card(path: Path, file: str, place: Place, scores: Sequence[Score] = ()) -> s
         f"- **How it works and is trained:** {_guide(purpose.guide, place.docs)}",
         "## Weights\n\n" + _table(("what", "value"), _weights(record, file)),
         "## Training\n\n" + _table(("what", "value"), _training(record)),
-        f"The command, in which earlier weights of the same name may stand for where it began:\n\n{_command(record)}",
+        "The command, with the options of the commit above, which may have other names today; earlier weights of the same "
+        f"name may stand for where it began:\n\n{_command(record)}",
         "## Scores",
         *_scores(record, place, scores),
         "## Configuration\n\n" + _table(("setting", "value"), _settings(record)),
