@@ -48,8 +48,13 @@ intervals of the success rate, s.e. is the standard error. A row marked † was 
 that ship now; the JSON has the digests of its weights, and every episode.
 """
 TABLE_1 = """The agents that modular RL is compared with ([how each is trained](../baselines.md)). The
-paper trained each for weeks with 256 to 1,000 actors, and reports the best of many settings; here steps and CPU hours
-are what the row was given.
+paper trained them for up to 21 days with 1,000 actors (fully observable) and 5 days with 256 (partially observable),
+and reports the best of many settings; here steps and CPU hours are what the row was given.
+"""
+FIGURE_4 = """Trainings on the way to the weights that ship, without the last ones: six of the controller's seven runs;
+the planner's of 48 channels, not those that widened it to 64; of estimator and termination the first of two rounds.
+Runs of a module are drawn end to end, so that a curve may drop where one begins, and the axes of rates are cut. The
+[model cards](../models/) have the scores of the weights that ship.
 """
 FIGURE_5 = """In the reference world, with ground-truth sense, as in the paper; the planner is the one that ships, and
 knows of no body.
@@ -155,7 +160,7 @@ def _figure_4(folder: Path) -> list[str]:
     missing = figures.curves(folder / "figure4.png")
     sections = []
     if len(missing) < len(curves.MODULES):
-        sections += ["![Learning curves of the modules](figure4.png)\n"]
+        sections += [FIGURE_4, "![Learning curves of the modules](figure4.png)\n"]
     if missing:
         options = " ".join(f"--{module} RUN" for module in missing)
         sections += _missing(f"The curve of {', '.join(missing)}", f"python -m benchmarks.paper.curves {options}")

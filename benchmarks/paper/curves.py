@@ -47,7 +47,7 @@ MEASURES: Final = {
         Measure(("train/box",), "loss of the box layer"),
     ),
     "termination": (
-        Measure(("evaluation/termination_precision",), "terminations in time"),
+        Measure(("evaluation/termination_precision",), "terminations not too early"),
         Measure(("train/beta",), "loss of beta"),
     ),
 }
@@ -67,7 +67,7 @@ class Options:
     """Estimator and termination are trained together: name the run for both."""
     termination: tuple[Path, ...] = ()
     variant: str = ""
-    """Name of another way to train, whose curve stands beside that of the shipped weights."""
+    """Name of another way to train, whose curve stands beside the supervised one."""
     append: bool = False
     """Go on after the last point of the file, as where the metrics of earlier runs are lost."""
     out: Path = JSON

@@ -94,7 +94,7 @@ def baseline_curves(file: Path) -> bool:
 def curves(file: Path) -> list[str]:
     """Draw the learning curves of the modules (paper Fig. 4) that there are; return the modules without one.
 
-    Beside that of the shipped weights stand the variants of a module, such as MPO alone.
+    Beside the supervised training towards the weights that ship stand the variants of a module, such as MPO alone.
 
     Raises:
         ResultError: If a curve is not what `benchmarks.paper.curves` writes.
@@ -109,7 +109,7 @@ def curves(file: Path) -> list[str]:
             prefix = f"curve_{module}_"
             others = {f.stem.removeprefix(prefix): _points(f) for f in sorted(sources.JSON.glob(f"{prefix}*.jsonl"))}
             variants = {_VARIANTS.get(name, name.replace("_", " ")): curve for name, curve in others.items()}
-            for name, curve in {"weights that ship": points, **variants}.items():
+            for name, curve in {"supervised": points, **variants}.items():
                 steps, values = [p["step"] / 1e6 for p in curve], [p["value"] for p in curve]
                 axes.plot(steps, values, marker=".", markersize=3, label=name)
             what = {p["what"] for curve in (points, *others.values()) for p in curve}

@@ -195,7 +195,7 @@ def test_figures_name_their_axes_their_bars_and_each_curve_in_words(folder, draw
     figures.curves(folder / "figure4.png")
     (axes,) = drawn()
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("million samples", "instructions completed")
-    assert words(axes) == ["weights that ship", "MPO alone, from nothing", "other way"]
+    assert words(axes) == ["supervised", "MPO alone, from nothing", "other way"]
     assert axes.yaxis.get_major_formatter()(0.5, 0) == "50 %"
     (runs.JSON / "curve_controller_mpo.jsonl").write_text('{"step": 0, "value": 1.5, "what": "loss"}\n')
     with pytest.raises(runs.ResultError, match=r"curve_controller\.jsonl: expected curves of one measure"):
