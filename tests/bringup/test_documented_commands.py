@@ -10,14 +10,19 @@ import pytest
 import mujoban_core.program
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+GUIDES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "docs" / "results" / "README.md", *GUIDES]
 _SCRIPTS = {"mujoban-run": "run_stack", "mujoban-evaluate": "evaluate", "mujoban-record": "record"}
 
 
 def commands(page: Path) -> list[str]:
-    """Return the indented command lines of a page, those that go on over several lines as one."""
+    """Return the command lines of a page, indented or in a fenced block; those that go on over several lines as one."""
     text = page.read_text().replace("\\\n", " ")
-    return re.findall(r"^ {4}((?:python|mujoban-(?:run|evaluate|record)|make) .*)$", text, re.MULTILINE)
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    fenced = "\n".join(block for language, block in blocks if language in ("", "sh", "bash"))
+    command = r"((?:python|mujoban-(?:run|evaluate|record)|make) .*)$"
+    return re.findall(rf"^ {{4,}}{command}", text, re.MULTILINE) + re.findall(f"^{command}", fenced, re.MULTILINE)
+
 
 
 def program(words: list[str]) -> tuple[str, list[str]]:
@@ -50,8 +55,14 @@ def test_a_documented_command_exists_and_understands_its_options(command, monkey
         raise Read
 
     monkeypatch.setattr(found, "read_options", read_and_stop)
-    with pytest.raises(Read):
+    with pytest.raises((Read, SystemExit)) as ended:
         found.main(arguments)
+    assert ended.type is Read or "--help" in arguments
+
+
+def test_commands_in_fences_and_in_steps_of_a_list_are_read_too():
+    found = {page.name: " ".join(commands(page)) for page in GUIDES}
+    assert "--stage distil" in found["controller.md"] and "mujoban_estimator.evaluate" in found["estimator.md"]
 
 
 def test_a_documented_target_of_make_exists():
