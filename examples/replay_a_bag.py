@@ -1,7 +1,7 @@
 """Read a recorded bag tick by tick, without ROS: `python examples/replay_a_bag.py BAG`.
 
 `bringup/run_stack.py --record BAG` and `bringup/record.py` write bags; `ros2 bag play BAG` plays one back as topics.
-Here its torques are applied again to the level that it names: the world is the same to the last bit.
+Here its torques are applied again to the level, body and world that it names: all is the same to the last bit.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from mujoban_core.bodies import BALL
 from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags.training import episodes, open_training_bag
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.levels import Level
@@ -26,9 +28,11 @@ def main(arguments: Sequence[str]) -> int:
     """Play every episode of a bag again and say how far the robot is from where it was recorded."""
     if len(arguments) != 1:
         raise ValueError(f"{len(arguments)} arguments, expected one: the path of a bag")
-    for ticks in episodes(open_training_bag(Path(arguments[0]), TOPICS), TOPICS):
+    bag = open_training_bag(Path(arguments[0]), TOPICS)
+    body, name = bag.about.get("body", BALL.name), bag.about.get("world", DEFAULT_WORLD)
+    for ticks in episodes(bag, TOPICS):
         spec = EpisodeSpec(Level.from_text(ticks[0][0].level), ticks[0][0].seed)
-        world = World(1, max_boxes=len(spec.level.boxes))
+        world = World(1, body=body, world=name, max_boxes=len(spec.level.boxes))
         world.reset([0], [spec])
         apart = 0.0
         for _, pose, torque in ticks:

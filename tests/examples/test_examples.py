@@ -11,6 +11,7 @@ import pytest
 from bringup.rollout import ticks
 from bringup.rollout_recorder import Recorder
 from mujoban_core.bodies import BALL
+from mujoban_sim.presets import WORLDS
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
@@ -58,10 +59,11 @@ def test_a_module_is_replaced(run):
     assert "oracle planner\n  solved 2 of 2" in said and "random planner\n  solved" in said
 
 
-def test_a_bag_is_replayed(run, oracles, tmp_path):
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_bag_is_replayed_in_the_world_that_it_names(run, oracles, tmp_path, world):
     spec = EpisodeSpec(generate_level(1, TRAIN_SEEDS.start), TRAIN_SEEDS.start)
-    with Recorder(tmp_path / "bag", BALL, [spec], [1]) as recorder:
-        for tick in ticks(oracles.policy(), World(1, max_boxes=1), [spec], camera=True):
+    with Recorder(tmp_path / "bag", BALL, [spec], [1], world=world) as recorder:
+        for tick in ticks(oracles.policy(), World(1, world=world, max_boxes=1), [spec], camera=True):
             recorder.write(tick)
     (bag,) = (tmp_path / "bag").iterdir()
     assert f"seed {spec.seed}: {tick.step[0] + 1} ticks, at most 0.0e+00 apart" in run("replay_a_bag.py", bag)
