@@ -34,6 +34,11 @@ def generate_launch_description() -> LaunchDescription:
         "python": (str(OWN if OWN.exists() else sys.executable), "interpreter of the environment that has mujoban"),
         "params_file": (str(ROOT / "bringup/config/stack.yaml"), "parameters of the nodes"),
         "module": ("learned", "what plays the four modules: learned or oracle"),
+        # As in run_stack.py: who is told the truth has no need to look around.
+        "look_around": (
+            PythonExpression(["0 if '", LaunchConfiguration("module"), "' == 'oracle' else 40"]),
+            "ticks of a turn on the spot, 0 for none",
+        ),
         "difficulty": ("5", "of the levels"),
         "realtime": ("1.0", "simulated seconds per second; 0.0 is lockstep"),
         "viz": ("true", "whether RViz and Foxglove get topics of their own"),
@@ -49,8 +54,13 @@ def generate_launch_description() -> LaunchDescription:
         kept = {name: text for name, text in os.environ.items() if name not in MIXING}
         return ExecuteProcess(cmd=command, cwd=str(ROOT), env=kept, output="screen", **options)
 
-    # As in run_stack.py: in real time the clock would wait for what a restarted planner can no longer say.
-    timely = ("-p", ["patience:=", PythonExpression(["1 if float('", value["realtime"], "') else 60"])])
+    looking = ("-p", ["look_around:=", value["look_around"]])
+    own = {
+        # As in run_stack.py: in real time the clock would wait for what a restarted planner can no longer say.
+        "termination": ("-p", ["patience:=", PythonExpression(["1 if float('", value["realtime"], "') else 60"])]),
+        "planner": looking,
+        "controller": looking,
+    }
 
     return LaunchDescription(
         [
@@ -61,7 +71,7 @@ def generate_launch_description() -> LaunchDescription:
                 "-p", ["realtime:=", value["realtime"]],
             ),
             *(
-                node(module, "-p", ["module:=", value["module"]], *(timely if name == "termination" else ()))
+                node(module, "-p", ["module:=", value["module"]], *own.get(name, ()))
                 for name, module in MODULES.items()
             ),
             node("bringup.viz", condition=IfCondition(value["viz"])),

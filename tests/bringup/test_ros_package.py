@@ -2,8 +2,15 @@
 
 import os
 import re
+import runpy
 import subprocess
+import sys
 from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from mujoban_core.look_around import LOOK_AROUND_TICKS
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "bringup" / "ros_package"
@@ -35,3 +42,52 @@ def test_a_program_starts_in_its_environment_and_takes_nothing_of_the_ros_that_w
     command = [program, "--ros-args", "-p", "module:=oracle"]
     said = subprocess.run(command, env={**os.environ, **sourced}, check=True, capture_output=True, text=True).stdout
     assert said == "|||7|-m mujoban_planner.node --ros-args -p module:=oracle\n"
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Return a function that gives the commands of the launch file's nodes, without the package `launch`."""
+    given: dict[str, str] = {}
+
+    def text(part):
+        return part if isinstance(part, str) else "".join(map(text, part)) if isinstance(part, list) else part()
+
+    def argument(name, default_value, description):
+        given.setdefault(name, text(default_value))
+
+    def process(cmd, **options):
+        return [text(word) for word in cmd]
+
+    for name, values in {
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {"DeclareLaunchArgument": argument, "ExecuteProcess": process},
+        "launch.conditions": {"IfCondition": lambda value: None},
+        "launch.substitutions": {
+            "LaunchConfiguration": lambda name: lambda: given[name],
+            "PythonExpression": lambda parts: lambda: str(eval(text(parts))),
+        },
+    }.items():
+        module = ModuleType(name)
+        module.__dict__.update(values)
+        monkeypatch.setitem(sys.modules, name, module)
+
+    def commands(**arguments):
+        given.clear()
+        given.update(arguments)
+        described = runpy.run_path(str(ROOT / "bringup/launch/mujoban.launch.py"))["generate_launch_description"]()
+        return {command[2]: command for command in described if command}
+
+    return commands
+
+
+@pytest.mark.parametrize(
+    ("arguments", "ticks"),
+    [({}, LOOK_AROUND_TICKS), ({"module": "oracle"}, 0), ({"module": "oracle", "look_around": "8"}, 8)],
+)
+def test_launched_oracles_do_not_look_around(launched, arguments, ticks):
+    nodes = launched(**arguments)
+    assert len(nodes) == 6
+    for name in ("mujoban_planner.node", "mujoban_controller.node"):
+        assert f"look_around:={ticks}" in nodes[name]
+    assert "look_around" not in " ".join(nodes["mujoban_estimator.node"])
+    assert "patience:=1" in nodes["mujoban_estimator.termination_node"]
