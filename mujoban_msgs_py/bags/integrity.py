@@ -6,7 +6,7 @@ import errno
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -22,6 +22,8 @@ IDENTITY: Final = "mujoban_bag"
 """Name of the MCAP metadata record that says which file of which bag a file is; the first record of the file."""
 LAST: Final = "mujoban_last_file"
 """Name of the MCAP metadata record in the last file of a bag that was closed."""
+_ABOUT: Final = "mujoban/"
+"""Beginning of the keys of what was recorded."""
 _BLOCK: Final = 1 << 20
 
 
@@ -32,6 +34,8 @@ class Identity(NamedTuple):
     """A number that no other bag has."""
     index: int
     """From 0."""
+    about: Mapping[str, str]
+    """What was recorded, as `Metadata.about`: a file may be all that is left of a bag."""
 
 
 class Reserve:
@@ -134,7 +138,8 @@ def read_identity(path: Path) -> Identity | None:
         with path.open("rb") as stream:
             for record in StreamReader(stream, emit_chunks=True, record_size_limit=_BLOCK).records:
                 if isinstance(record, Metadata) and record.name == IDENTITY:
-                    return Identity(record.metadata["bag"], int(record.metadata["index"]))
+                    told = record.metadata
+                    return Identity(told["bag"], int(told["index"]), load_about(told))
                 if isinstance(record, Chunk):
                     return None
     except (McapError, ValueError, KeyError, EOFError, OSError, RuntimeError):
@@ -172,4 +177,14 @@ def check_family(identities: dict[Path, Identity | None], complain: Callable[[st
 
 def dump_identity(identity: Identity) -> dict[str, str]:
     """Return the content of the `IDENTITY` record."""
-    return {"bag": identity.bag, "index": str(identity.index)}
+    return {"bag": identity.bag, "index": str(identity.index), **dump_about(identity.about)}
+
+
+def dump_about(about: Mapping[str, str]) -> dict[str, str]:
+    """Return what was recorded by the keys under which metadata.yaml and the files carry it."""
+    return {_ABOUT + name: value for name, value in about.items()}
+
+
+def load_about(told: Mapping[str, str]) -> dict[str, str]:
+    """Return what was recorded from what metadata.yaml or a file carries."""
+    return {key.removeprefix(_ABOUT): value for key, value in told.items() if key.startswith(_ABOUT)}

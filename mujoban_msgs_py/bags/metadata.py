@@ -15,6 +15,7 @@ import yaml
 
 from mujoban_core.files import write_atomically
 from mujoban_msgs_py.bags.errors import BagError
+from mujoban_msgs_py.bags.integrity import dump_about, load_about
 
 FILE_NAME: Final = "metadata.yaml"
 VERSION: Final = 9
@@ -27,8 +28,6 @@ _BAG: Final = "mujoban_bag"
 """Key of `Metadata.bag` in the custom data."""
 _DIGEST: Final = "sha256/"
 """Beginning of the keys of the files' checksums in the custom data."""
-_ABOUT: Final = "mujoban/"
-"""Beginning of the keys of `Metadata.about` in the custom data."""
 _OWN_DIGEST: Final = "mujoban_metadata_sha256"
 """Key of the checksum of all else in the file."""
 _FOREVER: Final = {"sec": 9223372036, "nsec": 854775807}
@@ -123,7 +122,7 @@ class Metadata:
                 files=_files(information, custom),
                 compression_mode=_text(information.get("compression_mode") or "").lower(),
                 bag=_text(custom.get(_BAG, "")),
-                about={k.removeprefix(_ABOUT): _text(v) for k, v in custom.items() if k.startswith(_ABOUT)},
+                about={name: _text(value) for name, value in load_about(custom).items()},
             )
         except (yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
             reason = " ".join(str(error).split())
@@ -150,8 +149,7 @@ class Metadata:
 
     def _custom(self) -> dict[str, str]:
         digests = {_DIGEST + file.path: file.digest for file in self.files if file.digest}
-        about = {_ABOUT + name: value for name, value in self.about.items()}
-        return digests | about | ({_BAG: self.bag} if self.bag else {})
+        return digests | dump_about(self.about) | ({_BAG: self.bag} if self.bag else {})
 
 
 # libyaml writes ten times as fast: a recording of many bags closes in the time that a user waits for.

@@ -202,14 +202,15 @@ def open_bag(path: str | Path, *, damaged: Damage = "refuse") -> Bag:
     if not path.exists():
         raise BagError(f"no bag at {path}, expected a folder or a file (.mcap, .db3) of one")
     if not path.is_dir():
-        return Bag(path, [_storage(path, damaged)])
+        storage, identity = _storage(path, damaged), read_identity(path)
+        return Bag(path, [storage], about=identity and identity.about)
     metadata = Metadata.read(path)
     files = sorted((*path.glob("*.mcap"), *path.glob("*.db3")), key=_number)
     doubts = _Doubts(path, damaged)
     if metadata is None:
         if not files:
             raise BagError(f"{path} is not a bag: it has neither {FILE_NAME} nor .mcap or .db3 files")
-        return Bag(path, _without_metadata(files, doubts), doubts.noted)
+        return _without_metadata(path, files, doubts)
     if metadata.storage not in ("mcap", "sqlite3") or metadata.compression_mode in ("file", "message"):
         kind = f"{metadata.storage} storage {metadata.compression_mode}".strip()
         raise BagError(f"{path} has {kind}: expected sqlite3, or mcap without compression of files or messages")
@@ -248,15 +249,17 @@ class _Doubts:
         self.noted.append(what)
 
 
-def _without_metadata(files: Sequence[Path], doubts: _Doubts) -> list[Storage]:
-    """Return the files of a bag that has lost its metadata.yaml."""
+def _without_metadata(path: Path, files: Sequence[Path], doubts: _Doubts) -> Bag:
+    """Open a bag that has lost its metadata.yaml."""
     for file in files:
         require_regular(file)
     identities = {file: read_identity(file) for file in files}
     storages = {file: _storage(file, "skip" if doubts.skips else "refuse") for file in files}
     ours = [storage for file, storage in storages.items() if identities[file] is not None]
     last = any(isinstance(storage, McapFile) and storage.is_last for storage in ours)
-    return [storages[file] for file in check_family(identities, doubts, last=last)]
+    kept = check_family(identities, doubts, last=last)
+    about = next((identity.about for file in kept if (identity := identities[file]) is not None), None)
+    return Bag(path, [storages[file] for file in kept], doubts.noted, about)
 
 
 def _listed(path: Path, metadata: Metadata, files: Sequence[Path], doubts: _Doubts) -> list[FileRecord]:

@@ -21,7 +21,7 @@ def recover_bag(source: str | Path, target: str | Path) -> list[str]:
     bag = open_bag(source, damaged="skip")
     if not bag.topics:
         raise BagError(f"nothing can be recovered from {source}: it has no whole chunk")
-    with BagWriter(target) as writer:
+    with BagWriter(target, about=bag.about) as writer:
         for info in bag.topics.values():
             writer.add_topic(info.name, info.type_name, info.qos)
         for message in bag.messages():

@@ -199,7 +199,7 @@ class BagWriter:
             enable_data_crcs=True,
         )
         self._writer.start(profile=PROFILE)
-        identity = Identity(self._metadata.bag, len(self._metadata.files))
+        identity = Identity(self._metadata.bag, len(self._metadata.files), self._metadata.about)
         self._writer.add_metadata(IDENTITY, dump_identity(identity))
         self._channels, self._schemas = {}, {}
         self._metadata.files.append(file)

@@ -25,9 +25,12 @@ def pose(tick):
     return serialize_message(conversions.pose_to_msg(conversions.header(tick * TICK), (tick, 0.5, 0.25)))
 
 
+ABOUT = {"body": "ant", "world": "reference"}
+
+
 def write_bag(path, ticks=30, first=1):
     """Write a bag of three files."""
-    with BagWriter(path, [topics.POSE], episodes_per_file=1, chunk_size=500, flush_after=4) as bag:
+    with BagWriter(path, [topics.POSE], episodes_per_file=1, chunk_size=500, flush_after=4, about=ABOUT) as bag:
         for tick in range(first, first + ticks):
             bag.write(topics.POSE.name, tick * TICK, pose(tick))
             if tick % 10 == 0:
@@ -174,6 +177,17 @@ def test_damaged_metadata_is_one_error(bag, text):
     (bag / "metadata.yaml").write_text(text, encoding="latin-1")
     with pytest.raises(BagError, match="is not the metadata of a rosbag2 bag"):
         open_bag(bag)
+
+
+def test_whatever_is_left_of_a_bag_names_what_was_recorded(bag, tmp_path):
+    assert open_bag(bag).about == ABOUT
+    recover_bag(bag, tmp_path / "whole")
+    assert open_bag(tmp_path / "whole").about == ABOUT
+    assert open_bag(bag / "bag_1.mcap").about == ABOUT
+    (bag / "metadata.yaml").unlink()
+    assert open_bag(bag).about == ABOUT
+    (bag / "bag_2.mcap").unlink()
+    assert open_bag(bag, damaged="skip").about == ABOUT
 
 
 @pytest.fixture
