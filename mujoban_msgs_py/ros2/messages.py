@@ -96,7 +96,7 @@ def parse_values(text: str) -> dict[str, Any]:
     return values
 
 
-def fill(message: Message, values: dict[str, Any], now: Time | None = None) -> None:
+def fill(message: Message, values: dict[str, Any], now: Time) -> None:
     """Set fields of a message.
 
     Args:
@@ -119,7 +119,7 @@ def fill(message: Message, values: dict[str, Any], now: Time | None = None) -> N
             raise CommandError(f"{value!r} does not fit field '{name}' of type {kinds[name]}") from None
 
 
-def _convert(value: Any, kind: str, now: Time | None) -> Any:
+def _convert(value: Any, kind: str, now: Time) -> Any:
     """Return a value as the field of a message takes it."""
     sequence = _SEQUENCE.match(kind)
     if sequence:

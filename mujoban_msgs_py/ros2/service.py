@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from builtin_interfaces.msg import Time
+
 from mujoban_msgs_py.ros2.messages import fill, parse_values
 from mujoban_msgs_py.ros2.session import (
     CommandError,
@@ -73,14 +75,16 @@ def call(options: argparse.Namespace) -> int:
         raise CommandError(f"--rate must be greater than zero, got {options.rate}")
     kind: Any = import_type(options.service_type, "srv")
     name = full_name(options.service_name)
-    request = kind.Request()
-    fill(request, parse_values(options.values))
+    values = parse_values(options.values)
+    fill(kind.Request(), values, Time())  # what does not fit is refused before anybody is waited for
     with Session(options) as session:
         client = session.node.create_client(kind, name)
         if not client.service_is_ready():
             print("waiting for service to become available...", flush=True)
             session.wait_for(client.service_is_ready, f"the service {name} did not become available")
         while True:
+            request = kind.Request()
+            fill(request, values, session.node.get_clock().now().to_msg())
             print(f"requester: making request: {request!r}\n", flush=True)
             future = client.call_async(request)
             session.until(future.done, None)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from builtin_interfaces.msg import Time
+
 from mujoban_msgs_py.ros2.messages import fill, parse_values
 from mujoban_msgs_py.ros2.session import (
     CommandError,
@@ -46,7 +48,7 @@ def publish(options: argparse.Namespace) -> int:
         raise CommandError(f"--rate must be greater than zero, got {options.rate}")
     kind = import_type(options.message_type, "msg")
     values = parse_values(options.values)
-    fill(kind(), values)
+    fill(kind(), values, Time())  # what does not fit is refused before anybody is waited for
     times = 1 if options.once else options.times
     # As the genuine command: a message that is sent a few times only should reach somebody.
     wanted = options.wait_matching_subscriptions

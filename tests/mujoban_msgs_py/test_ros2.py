@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -134,6 +135,20 @@ def test_pub_reaches_a_subscriber(talker):
     while not talker.heard and time.monotonic() < deadline:
         time.sleep(0.01)
     assert talker.heard == ["hello"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "before"),
+    [
+        ("geometry_msgs/msg/PoseStamped", "{header: auto}", "header=std_msgs.msg.Header("),
+        ("std_msgs/msg/Header", "{stamp: now}", "std_msgs.msg.Header("),
+    ],
+)
+def test_pub_stamps_with_the_time_where_it_is_asked_to(kind, values, before):
+    sent_at = time.time()
+    text = ros2("topic", "pub", "--once", "-w", "0", "--keep-alive", "0", "/stamped", kind, values)
+    stamp = re.search(rf"{re.escape(before)}stamp=builtin_interfaces\.msg\.Time\(sec=(\d+), nanosec=\d+\)", text)
+    assert stamp is not None and int(sent_at) <= int(stamp[1]) <= time.time()
 
 
 def test_nodes_are_listed_and_described(talker):
@@ -307,13 +322,13 @@ def test_long_arrays_are_truncated_unless_asked_for():
 
 def test_fields_are_filled_from_nested_values():
     pose = topics.POSE.type()
-    fill(pose, {"header": {"frame_id": "map"}, "pose": {"position": {"x": 3}}})
+    fill(pose, {"header": {"frame_id": "map"}, "pose": {"position": {"x": 3}}}, Time())
     assert (pose.header.frame_id, pose.pose.position.x) == ("map", 3.0)
     torque = topics.TORQUE.type()
-    fill(torque, {"effort": [1, 0.5], "name": ["a", "b"]})
+    fill(torque, {"effort": [1, 0.5], "name": ["a", "b"]}, Time())
     assert list(torque.effort) == [1.0, 0.5]
     with pytest.raises(CommandError, match="no field 'q'"):
-        fill(pose, {"pose": {"q": 1}})
+        fill(pose, {"pose": {"q": 1}}, Time())
 
 
 def test_the_genuine_command_is_found_and_gets_a_clean_environment(tmp_path):
