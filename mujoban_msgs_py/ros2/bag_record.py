@@ -51,10 +51,19 @@ class Recorder:
         self._bag = bag
         self._wanted = {full_name(name) for name in (*options.topics, *options.more_topics)}
         self._excluded = {full_name(name) for name in options.exclude_topics}
+        self._sim_time = options.use_sim_time
         self._all, self._hidden = options.all, options.include_hidden_topics
         self._pattern = re.compile(options.regex) if options.regex else None
         self._seen: set[str] = set()
         self._log = session.node.get_logger().get_child("rosbag2_recorder")
+
+    def begin(self) -> None:
+        """Wait for /clock where its time is wanted: until then it is 0, which would be the bag's beginning."""
+        if self._sim_time:
+            self._log.info("use_sim_time set, waiting for /clock before starting recording...")
+            clock = self._session.node.get_clock()
+            self._session.until(lambda: clock.now().nanoseconds > 0, None)
+        self._log.info("Recording...")
 
     def look(self) -> None:
         """Subscribe to topics that have appeared."""
@@ -99,8 +108,8 @@ def record(options: argparse.Namespace) -> int:
         raise CommandError(f"--regex '{options.regex}' is not a regular expression: {error}") from None
     with Session(options, sim_time=options.use_sim_time) as session, BagWriter(path) as bag:
         recorder = Recorder(session, bag, options)
-        session.node.get_logger().get_child("rosbag2_recorder").info("Recording...")
         try:
+            recorder.begin()
             while True:
                 recorder.look()
                 session.spin_for(max(options.polling_interval, 1) / 1000)

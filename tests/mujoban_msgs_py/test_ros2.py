@@ -210,6 +210,24 @@ def test_records_until_interrupted(talker, tmp_path):
     assert bag.topics["/episode"].count == 1
 
 
+def test_what_is_recorded_in_simulated_time_begins_with_the_clock(talker, tmp_path):
+    process = start("bag", "record", "--use-sim-time", "-o", str(tmp_path / "bag"), "/pose", "/episode")
+    assert "waiting for /clock" in process.stderr.readline()
+    time.sleep(1.0)
+    clock = talker.create_publisher(topics.CLOCK.type, topics.CLOCK.name, topics.CLOCK.qos)
+    timer = talker.create_timer(0.02, lambda: clock.publish(conversions.clock_to_msg(1000 * 10**9)))
+    while "Subscribed to topic '/pose'" not in process.stderr.readline():
+        assert process.poll() is None
+    time.sleep(1.0)
+    talker.destroy_timer(timer)
+    talker.destroy_publisher(clock)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) == 0
+    bag = open_bag(tmp_path / "bag")
+    assert bag.topics["/pose"].count > 5 and bag.topics["/episode"].count == 1
+    assert bag.span == (1000 * 10**9, 1000 * 10**9)
+
+
 @pytest.fixture
 def bag(tmp_path) -> Path:
     from rclpy.serialization import serialize_message
