@@ -184,19 +184,19 @@ def recorded_seed(seed: int | None, *, records: bool, allow_test_seeds: bool) ->
     Args:
         seed: As given on the command line; None where it was not.
         records: Whether the episodes are recorded.
-        allow_test_seeds: Whether they may be recorded though they are kept for tests.
+        allow_test_seeds: Whether they may be recorded though they are not for training.
 
     Raises:
-        ValueError: If they are kept for tests and that is not allowed.
+        ValueError: If they are not for training and that is not allowed.
     """
-    from mujoban_sokoban.generator import TEST_SEEDS, TRAIN_SEEDS
+    from mujoban_sokoban.generator import TRAIN_SEEDS
 
     if seed is None:
         return TRAIN_SEEDS.start if records else 0
-    if records and seed in TEST_SEEDS and not allow_test_seeds:
+    if records and seed not in TRAIN_SEEDS and not allow_test_seeds:
         raise ValueError(
-            f"--seed {seed}: its levels are kept for tests; expected one from {TEST_SEEDS.stop} on for a recording, "
-            "or --allow-test-seeds"
+            f"--seed {seed}: its levels are not for training; expected one from {TRAIN_SEEDS.start} on for a "
+            "recording, or --allow-test-seeds"
         )
     return seed
 

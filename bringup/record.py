@@ -115,7 +115,7 @@ class Options:
     seed: Annotated[int | None, whole("N", 0)] = None
     """Of the first episode; by default the first for training."""
     allow_test_seeds: bool = False
-    """Record also levels that are kept for tests, not for training."""
+    """Record also levels that are not for training."""
     advanced: float = 0.5
     """Share of episodes that begin along a solution."""
     time_limit: Annotated[int, whole("STEPS", 0)] = 600

@@ -41,7 +41,7 @@ class Options:
     record: FolderPath = None
     """Record all topics into a bag."""
     allow_test_seeds: bool = False
-    """Record also levels that are kept for tests, not for training."""
+    """Record also levels that are not for training."""
     episodes_per_file: Count = 32
     """Episodes in one file of the bag."""
     video: FilePath = None

@@ -62,7 +62,7 @@ class Options:
     skip_damaged: bool = False
     """Leave damaged parts of bags out instead of refusing them."""
     allow_test_seeds: bool = False
-    """Learn also from episodes whose seeds are reserved for tests."""
+    """Learn also from episodes whose levels are not for training."""
 
 
 def make_trainer(options: Options) -> Trainer[Batch]:

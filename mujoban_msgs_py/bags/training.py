@@ -1,4 +1,4 @@
-"""The one reader of training episodes: it finds bags, checks them, and never yields a level that is kept for tests.
+"""The one reader of training episodes: it finds bags, checks them, and never yields a level that is not for training.
 
 bags = [open_training_bag(path, wanted) for path in find_bags(folders)]
 for episode, values in episode_ticks(bags[0], wanted):
@@ -81,7 +81,7 @@ def bags_digest(folders: Sequence[Path]) -> str | None:
 
 
 def require_training_seeds(bag: Bag) -> None:
-    """Refuse a bag that begins with an episode whose seed is kept for tests; recorders count seeds upwards.
+    """Refuse a bag that begins with an episode whose level is not for training; recorders count seeds upwards.
 
     It reads one message, so that it can be asked before anything else is started; `episode_ticks` looks at all.
 
@@ -89,14 +89,19 @@ def require_training_seeds(bag: Bag) -> None:
         BagError: If it does, or is damaged.
     """
     for value in bag.read([topics.TRUE_EPISODE.name]):
-        _require_training_seed(bag, value.value.seed)
+        _require_training_level(bag, value.value)
         return
 
 
-def _require_training_seed(bag: Bag, seed: int) -> None:
-    if seed not in TRAIN_SEEDS:
+def _require_training_level(bag: Bag, episode: EpisodeTruthReading) -> None:
+    if episode.difficulty == 0:
         raise BagError(
-            f"{bag.path} holds an episode with seed {seed}, which is kept for tests: expected seeds from "
+            f"{bag.path} holds an episode whose level comes from a file, which may be one for tests: "
+            "expected generated levels"
+        )
+    if episode.seed not in TRAIN_SEEDS:
+        raise BagError(
+            f"{bag.path} holds an episode with seed {episode.seed}, which is not for training: expected seeds from "
             f"{TRAIN_SEEDS.start} on, which recorders use unless they are told otherwise"
         )
 
@@ -137,10 +142,10 @@ def episode_ticks(
         wanted: Topics, with `topics.TRUE_EPISODE` among them.
         report: Counts what is read and left out.
         endings: Yield an episode's last tick as well, which no module answers: as `Bag.ticks`.
-        allow_test_seeds: Yield episodes with seeds that are kept for tests instead of refusing the bag.
+        allow_test_seeds: Yield episodes whose levels are not for training instead of refusing the bag.
 
     Raises:
-        BagError: As `Bag.ticks`, or if an episode's seed is not for training.
+        BagError: As `Bag.ticks`, or if an episode's level is not for training.
     """
     report = ReadReport() if report is None else report
     which = wanted.index(topics.TRUE_EPISODE)
@@ -148,7 +153,7 @@ def episode_ticks(
     for tick in bag.ticks(wanted, endings=endings):
         reading: EpisodeTruthReading = tick.values[which]
         if not allow_test_seeds:
-            _require_training_seed(bag, reading.seed)
+            _require_training_level(bag, reading)
         if reading.step == 0:
             number, following = reading.episode, 0
             report.episodes += 1

@@ -276,7 +276,7 @@ def test_an_unsolvable_level_is_played_and_said_to_be(tmp_path, capfd):
         (["--planner", "mujoban_sim.oracles:OracleController", *BUT_PLANNER], "Planner"),
         (["--realtime", "-2"], "-2"),
         (["--video", "film.avi", *ALL_ORACLES], "film.avi"),
-        (["--record", "bag", "--seed", "1000", *ALL_ORACLES], "--seed 1000: its levels are kept for tests"),
+        (["--record", "bag", "--seed", "1000", *ALL_ORACLES], "--seed 1000: its levels are not for training"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_on_stderr_and_status_2(capfd, arguments, named):
@@ -387,10 +387,12 @@ def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capf
     assert error.endswith("the controller was trained for the body ball: expected weights for ant, or an oracle")
 
 
-def test_levels_that_are_kept_for_tests_are_recorded_only_when_that_is_asked_for():
+def test_levels_that_are_not_for_training_are_recorded_only_when_that_is_asked_for():
     assert recorded_seed(None, records=False, allow_test_seeds=False) == 0
     assert recorded_seed(7, records=False, allow_test_seeds=False) == 7
     assert recorded_seed(None, records=True, allow_test_seeds=False) in TRAIN_SEEDS
     assert recorded_seed(7, records=True, allow_test_seeds=True) == 7
-    with pytest.raises(ValueError, match="--allow-test-seeds"):
-        recorded_seed(7, records=True, allow_test_seeds=False)
+    assert recorded_seed(10_000_000, records=True, allow_test_seeds=False) == 10_000_000
+    for seed in (7, 5_000_000, 9_999_999):
+        with pytest.raises(ValueError, match=r"expected one from 10000000 on .* or --allow-test-seeds"):
+            recorded_seed(seed, records=True, allow_test_seeds=False)

@@ -25,7 +25,7 @@ from mujoban_estimator.termination import TerminationConfig
 from mujoban_estimator.train import Options, main, make_trainer
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
-from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
+from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag, require_training_seeds
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_sokoban.generator import TRAIN_SEEDS
@@ -133,13 +133,19 @@ def test_paths_without_bags_are_named(tmp_path):
         find_bags([tmp_path])
 
 
-def test_episodes_kept_for_tests_are_refused(tmp_path):
-    episodes = MixedEpisodes(1, 1000, [1])
-    with Recorder(tmp_path, BALL, episodes, [1]) as recorder:
+@pytest.mark.parametrize(
+    ("seed", "difficulty", "named"),
+    [(1000, 1, "seed 1000"), (5_000_000, 1, "seed 5000000"), (SEED, 0, "whose level comes from a file")],
+)
+def test_episodes_that_are_not_for_training_are_refused(tmp_path, seed, difficulty, named):
+    episodes = MixedEpisodes(1, seed, [1])
+    with Recorder(tmp_path, BALL, episodes, [difficulty]) as recorder:
         for tick in made_up_ticks(episodes, (5,)):
             recorder.write(tick)
     paths = find_bags([tmp_path])
-    with pytest.raises(BagError, match="seed 1000"):
+    with pytest.raises(BagError, match=named):
+        require_training_seeds(open_training_bag(paths[0], TOPICS))
+    with pytest.raises(BagError, match=named):
         next(BagStream(paths, 8, np.random.default_rng(0)))
     assert next(BagStream(paths, 8, np.random.default_rng(0), allow_test_seeds=True)).first
 

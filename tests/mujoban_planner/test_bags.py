@@ -46,7 +46,7 @@ def test_decisions_are_labelled_by_the_truth_and_shown_as_they_were_estimated(ba
 
 def test_levels_that_are_kept_for_tests_are_refused(tmp_path):
     play_and_record(tmp_path, 5)
-    with pytest.raises(BagError, match="seed 5, which is kept for tests"):
+    with pytest.raises(BagError, match="seed 5, which is not for training"):
         Lessons.read([tmp_path], 0)
 
 

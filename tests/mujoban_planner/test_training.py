@@ -220,7 +220,7 @@ def test_the_push_that_solves_a_recorded_level_is_a_transition(tmp_path):
 
 def test_mpo_refuses_bags_with_levels_that_are_kept_for_tests(tmp_path):
     _record(tmp_path, 5)
-    with pytest.raises(BagError, match="seed 5, which is kept for tests"):
+    with pytest.raises(BagError, match="seed 5, which is not for training"):
         bag_transitions.BagTransitions.read([tmp_path])
 
 
