@@ -9,6 +9,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from mujoban_msgs_py.runtime.discovery import DOMAIN, chosen_domain
+
 DOMAINS = range(102)
 """Domains that Linux's ephemeral ports do not reach into."""
 
@@ -21,34 +23,32 @@ def claim_domain() -> Iterator[int]:
     machine holds, whoever runs it.
 
     Raises:
-        ValueError: If `ROS_DOMAIN_ID` is no number.
+        ValueError: If `ROS_DOMAIN_ID` is no domain.
         OSError: If another graph runs in that domain, or in all of them.
     """
-    chosen = os.environ.get("ROS_DOMAIN_ID")
-    if chosen:
-        if not chosen.isdecimal():
-            raise ValueError(f"ROS_DOMAIN_ID is {chosen!r}: expected a number from 0 on")
-        lock = _lock(int(chosen))
+    chosen = chosen_domain()
+    if chosen is not None:
+        lock = _lock(chosen)
         if lock is None:
             raise OSError(
                 f"another graph runs in ROS domain {chosen} on this machine, and the two would mix: "
-                "expected another ROS_DOMAIN_ID, or none"
+                f"expected another {DOMAIN}, or none"
             )
         with lock:
-            yield int(chosen)
+            yield chosen
         return
     for domain in DOMAINS:
         lock = _lock(domain)
         if lock is None:
             continue
         if domain != 0:
-            print(f"another graph runs on this machine: using ROS_DOMAIN_ID={domain}", file=sys.stderr)
-        os.environ["ROS_DOMAIN_ID"] = str(domain)
+            print(f"another graph runs on this machine: using {DOMAIN}={domain}", file=sys.stderr)
+        os.environ[DOMAIN] = str(domain)
         try:
             with lock:
                 yield domain
         finally:
-            del os.environ["ROS_DOMAIN_ID"]
+            del os.environ[DOMAIN]
         return
     raise OSError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are taken by graphs of this machine")
 

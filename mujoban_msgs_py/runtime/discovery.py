@@ -1,4 +1,4 @@
-"""How far nodes reach: this host alone, unless the environment says otherwise."""
+"""How far nodes reach: this host alone and its ROS domain 0, unless the environment says otherwise."""
 
 from __future__ import annotations
 
@@ -7,9 +7,26 @@ from pathlib import Path
 from typing import Final
 
 RANGE: Final = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+DOMAIN: Final = "ROS_DOMAIN_ID"
 PROFILES: Final = "FASTRTPS_DEFAULT_PROFILES_FILE"
 LOOPBACK: Final = Path(__file__).with_name("loopback.xml")
+HIGHEST_DOMAIN: Final = 232
+"""Beyond it there are no ports left for a domain: Fast DDS would end the process."""
 _FAST_DDS: Final = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
+
+
+def chosen_domain() -> int | None:
+    """Return the ROS domain that the environment names, or None where it names none.
+
+    Raises:
+        ValueError: If that is no domain.
+    """
+    chosen = os.environ.get(DOMAIN)
+    if not chosen:
+        return None
+    if not (chosen.isdecimal() and int(chosen) <= HIGHEST_DOMAIN):
+        raise ValueError(f"{DOMAIN} is {chosen!r}: expected a number from 0 to {HIGHEST_DOMAIN}")
+    return int(chosen)
 
 
 def reaches_further() -> bool:

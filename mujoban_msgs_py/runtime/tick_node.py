@@ -37,7 +37,7 @@ from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
-from mujoban_msgs_py.runtime.discovery import confine_discovery
+from mujoban_msgs_py.runtime.discovery import chosen_domain, confine_discovery
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.shared_memory import mapped_segments, release_segments
 from mujoban_msgs_py.seldom import is_due
@@ -251,12 +251,14 @@ def init_ros(args: Sequence[str] | None = None, context: Context | None = None) 
         context: What is initialised; None is the default context.
 
     Raises:
+        ValueError: If the environment names no possible ROS domain.
         OSError: If ROS cannot write its log.
     """
     confine_discovery()
+    domain = chosen_domain()
     given = None if args is None else list(args)
     try:
-        rclpy.init(args=given, context=context, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=given, context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
         folder = re.search(r"log directory '(.*?)'", str(error))
         if folder is None:

@@ -3,8 +3,10 @@
 import os
 
 import pytest
+from rclpy.context import Context
 
 from bringup.domain import claim_domain
+from mujoban_msgs_py.runtime.tick_node import ros_context
 
 
 def test_each_graph_takes_a_domain_of_its_own(monkeypatch, tmp_path):
@@ -25,6 +27,13 @@ def test_a_domain_that_is_asked_for_and_taken_is_refused(monkeypatch):
             pass
     with claim_domain():
         pass
-    monkeypatch.setenv("ROS_DOMAIN_ID", "ninety")
-    with pytest.raises(ValueError, match="'ninety': expected a number"), claim_domain():
+
+
+@pytest.mark.parametrize("chosen", ["ninety", "-1", "233"])
+def test_what_is_no_domain_is_refused_before_ros_sees_it(monkeypatch, chosen):
+    monkeypatch.setenv("ROS_DOMAIN_ID", chosen)
+    expected = f"ROS_DOMAIN_ID is '{chosen}': expected a number from 0 to 232"
+    with pytest.raises(ValueError, match=expected), claim_domain():
+        pass
+    with pytest.raises(ValueError, match=expected), ros_context([], Context()):
         pass
