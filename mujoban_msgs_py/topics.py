@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from geometry_msgs.msg import PoseArray, PoseStamped, TwistStamped
 from mujoban_msgs.msg import AbstractState, Episode, EpisodeTruth, Instruction, Proprioception, Termination
@@ -40,6 +40,9 @@ BODY_FRAME: Final = "base_link"
 
 class Message(Protocol):
     """A ROS message of whatever type."""
+
+    SLOT_TYPES: Any
+    """Of the fields in order: a tuple of what rosidl_parser describes them by."""
 
     @classmethod
     def get_fields_and_field_types(cls) -> dict[str, str]:

@@ -91,6 +91,8 @@ class Metadata:
     """What tells this bag from all others; empty for those of other writers."""
     about: dict[str, str] = field(default_factory=dict)
     """What was recorded, such as `world` and `body`."""
+    distribution: str = DISTRIBUTION
+    """Of the ROS 2 that recorded it; empty where it does not say."""
 
     def write(self, folder: Path) -> None:
         """Replace the file in `folder` atomically."""
@@ -122,6 +124,7 @@ class Metadata:
                 files=_files(information, custom),
                 compression_mode=_text(information.get("compression_mode") or "").lower(),
                 bag=_text(custom.get(_BAG, "")),
+                distribution=_text(information.get("ros_distro") or ""),
                 about={name: _text(value) for name, value in load_about(custom).items()},
             )
         except (yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError, RecursionError) as error:
@@ -144,7 +147,7 @@ class Metadata:
             "relative_file_paths": [file.path for file in self.files],
             "files": [_file_entry(file) for file in self.files],
             "custom_data": self._custom() or None,
-            "ros_distro": DISTRIBUTION,
+            "ros_distro": self.distribution,
         }
 
     def _custom(self) -> dict[str, str]:

@@ -53,15 +53,16 @@ class Bag:
     Attributes:
         path: The bag.
         about: What its recorder says of it, such as `world` and `body`; empty for those of others.
+        distribution: Of the ROS 2 that recorded it; empty where metadata.yaml is missing or does not say.
         incomplete: After `ticks`: messages that found no partner, by topic.
     """
 
     def __init__(
         self, path: Path, storages: Sequence[Storage], doubts: Sequence[str] = (),
-        about: Mapping[str, str] | None = None,
+        about: Mapping[str, str] | None = None, distribution: str = "",
     ) -> None:  # fmt: skip
         """Use `open_bag`."""
-        self.path, self.about = path, dict(about or {})
+        self.path, self.about, self.distribution = path, dict(about or {}), distribution
         self._doubts = tuple(doubts)
         self.incomplete: Counter[str] = Counter()
         self._storages = tuple(storages)
@@ -221,14 +222,14 @@ def open_bag(path: str | Path, *, damaged: Damage = "refuse") -> Bag:
             warnings.warn(f"{text}; `ros2 bag reindex` adds them", stacklevel=2)
         storages: list[Storage] = [SqliteBag(path, [path / file.path for file in listed])]
         _compare_counts(sum(file.count for file in listed), listed, storages[0], doubts)
-        return Bag(path, storages, doubts.noted, metadata.about)
+        return Bag(path, storages, doubts.noted, metadata.about, metadata.distribution)
     storages = []
     for file in listed:
         storage = _storage(path / file.path, damaged)
         storages.append(storage)
         if isinstance(storage, McapFile) and storage.complete:
             _compare_counts(file.count, [file], storage, doubts)
-    return Bag(path, storages, doubts.noted, metadata.about)
+    return Bag(path, storages, doubts.noted, metadata.about, metadata.distribution)
 
 
 class _Doubts:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.reader import open_bag
 from mujoban_msgs_py.bags.writer import BagWriter
+
+REPLACED: Final = ".damaged"
+"""End of the name that a bag gets whose place a recovered one takes; trainers pass it over among others."""
 
 
 def recover_bag(source: str | Path, target: str | Path) -> list[str]:

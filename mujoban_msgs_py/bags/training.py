@@ -19,13 +19,14 @@ from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.metadata import FILE_NAME
 from mujoban_msgs_py.bags.reader import Bag, open_bag
+from mujoban_msgs_py.bags.recovery import REPLACED
 from mujoban_msgs_py.conversions import EpisodeTruthReading
 from mujoban_msgs_py.topics import Topic
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
 
 def find_bags(folders: Sequence[Path]) -> list[Path]:
-    """Return the bags among the given paths: each is a bag, or a folder of bags.
+    """Return the bags among the given paths: each is a bag, or a folder of bags; what `REPLACED` ends is none of these.
 
     Raises:
         BagError: If there is none at a path.
@@ -34,18 +35,18 @@ def find_bags(folders: Sequence[Path]) -> list[Path]:
     for folder in folders:
         if not folder.exists():
             raise BagError(f"no bag at {folder}: expected a bag or a folder of bags")
-        if folder.is_file() or (folder / FILE_NAME).exists() or _has_files(folder):
+        if _is_bag(folder):
             found.append(folder)
             continue
-        below = sorted(p for p in folder.iterdir() if p.is_dir() and ((p / FILE_NAME).exists() or _has_files(p)))
+        below = sorted(p for p in folder.iterdir() if p.is_dir() and p.suffix != REPLACED and _is_bag(p))
         if not below:
             raise BagError(f"no bag in {folder}: expected folders with {FILE_NAME}, .mcap or .db3 files")
         found += below
     return found
 
 
-def _has_files(folder: Path) -> bool:
-    return any(folder.glob("*.mcap")) or any(folder.glob("*.db3"))
+def _is_bag(path: Path) -> bool:
+    return path.is_file() or (path / FILE_NAME).exists() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
 
 
 def open_training_bag(path: Path, wanted: Sequence[Topic], *, skip_damaged: bool = False) -> Bag:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from mujoban_msgs_py.bags import open_bag, recover_bag
-from mujoban_msgs_py.bags.metadata import DISTRIBUTION
+from mujoban_msgs_py.bags.recovery import REPLACED
 from mujoban_msgs_py.ros2 import bag_play, bag_record
+from mujoban_msgs_py.ros2.session import CommandError
 from mujoban_msgs_py.ros2.verbs import Verbs
 
 _UNITS: Final = ("B", "KiB", "MiB", "GiB", "TiB")
@@ -28,7 +29,7 @@ def add_verbs(commands: Verbs) -> None:
     parser.set_defaults(run=show_info)
     bag_play.add_verb(verbs)
     bag_record.add_verb(verbs)
-    parser = verbs.add_parser("reindex", help="Make a bag whole again whose recorder was killed")
+    parser = verbs.add_parser("reindex", help="Make a bag whole again, and keep the old one as NAME.damaged")
     parser.add_argument("bag_path", help="Bag to reindex")
     parser.set_defaults(run=reindex)
 
@@ -50,7 +51,7 @@ def show_info(options: argparse.Namespace) -> int:
     print("Files:            ", f"\n{_INDENT}".join(path.name for path in files))
     print("Bag size:         ", _size(sum(path.stat().st_size for path in files)))
     print("Storage id:       ", "sqlite3" if any(path.suffix == ".db3" for path in files) else "mcap")
-    print("ROS Distro:       ", DISTRIBUTION)
+    print("ROS Distro:       ", bag.distribution or "unknown")
     print("Duration:         ", f"{_seconds(end - start)}s")
     print("Start:            ", _moment(start))
     print("End:              ", _moment(end))
@@ -61,16 +62,22 @@ def show_info(options: argparse.Namespace) -> int:
 
 
 def reindex(options: argparse.Namespace) -> int:
-    """Replace a bag by all that is whole of it."""
+    """Put all that is whole of a bag in its place, and keep the bag under another name.
+
+    Raises:
+        CommandError: If there is something of that name.
+    """
     path = Path(options.bag_path)
-    partial = path.with_name(path.name + ".reindexed")
+    partial, replaced = path.with_name(path.name + ".reindexed"), path.with_name(path.name + REPLACED)
+    if replaced.exists():
+        raise CommandError(f"{replaced} exists already: expected that name to be free, for the bag as it was")
     shutil.rmtree(partial, ignore_errors=True)
     skipped = recover_bag(path, partial)
-    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    path.rename(replaced)
     partial.rename(path)
     for text in skipped:
         print(f"warning: {text}", file=sys.stderr)
-    print("Reindexing complete.")
+    print(f"Reindexing complete; the bag as it was is {replaced}.")
     return 0
 
 

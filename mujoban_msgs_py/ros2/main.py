@@ -6,6 +6,7 @@ import argparse
 import importlib
 import importlib.util
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,8 @@ from mujoban_core.signals import interrupt_status, interruptible
 FAILURE = 1
 """Exit status of a verb that could not do what it was asked for; the arguments' own errors have 2."""
 FAMILIES = ("bag", "interface", "node", "param", "service", "topic")
+INTERRUPTED = 2
+"""Exit status after Ctrl-C, as of the genuine command: the signal's number."""
 PACKAGE = "mujoban_msgs"
 
 
@@ -22,8 +25,8 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command.
 
     Returns:
-        Exit status: 0, 1 after one line on stderr about bad input, 2 after one about the arguments, 130 or 143 after
-        an interruption.
+        Exit status: 0, 1 after one line on stderr about bad input, 2 after one about the arguments or after Ctrl-C,
+        143 after SIGTERM.
     """
     arguments = list(sys.argv[1:] if args is None else args)
     # Where rosbag2 is missing, bags are read and written here.
@@ -88,7 +91,8 @@ def run(arguments: Sequence[str]) -> int:
         print(f"ros2: error: {' '.join(str(error).split())}", file=sys.stderr)
         return FAILURE
     except KeyboardInterrupt as error:
-        return interrupt_status(error)
+        status = interrupt_status(error)
+        return INTERRUPTED if status == 128 + signal.SIGINT else status
 
 
 def make_parser(family: str | None = None) -> argparse.ArgumentParser:

@@ -9,6 +9,7 @@ from typing import Any, Final, TypeGuard
 import numpy as np
 import yaml
 from builtin_interfaces.msg import Time
+from rosidl_parser.definition import AbstractNestedType, Array, BasicType, BoundedSequence, NamespacedType
 
 from mujoban_msgs_py.ros2.session import CommandError, import_type
 from mujoban_msgs_py.topics import Message
@@ -39,7 +40,7 @@ def to_yaml(
         no_str: Whether strings are described instead of shown.
         flow_style: Whether all of it goes on one line.
     """
-    plain = _plain(message, "", truncate, no_arr, no_str)
+    plain = _plain(message, None, truncate, no_arr, no_str)
     return yaml.safe_dump(
         plain, sort_keys=False, allow_unicode=True, width=float("inf"), default_flow_style=flow_style
     )
@@ -47,7 +48,7 @@ def to_yaml(
 
 def to_csv(message: object, *, truncate: int | None = 128, no_arr: bool = False, no_str: bool = False) -> str:
     """Return a message as one line of comma-separated values."""
-    return ",".join(str(leaf) for leaf in _leaves(_plain(message, "", truncate, no_arr, no_str)))
+    return ",".join(str(leaf) for leaf in _leaves(_plain(message, None, truncate, no_arr, no_str)))
 
 
 def _leaves(value: Any) -> list[Any]:
@@ -58,15 +59,14 @@ def _leaves(value: Any) -> list[Any]:
     return [value]
 
 
-def _plain(value: Any, kind: str, truncate: int | None, no_arr: bool, no_str: bool) -> Any:
+def _plain(value: Any, kind: object, truncate: int | None, no_arr: bool, no_str: bool) -> Any:
     """Return a value as dictionaries, lists and scalars."""
     if is_message(value):
-        fields = value.get_fields_and_field_types()
-        return {name: _plain(getattr(value, name), kind, truncate, no_arr, no_str) for name, kind in fields.items()}
+        kinds = zip(value.get_fields_and_field_types(), value.SLOT_TYPES, strict=True)
+        return {name: _plain(getattr(value, name), kind, truncate, no_arr, no_str) for name, kind in kinds}
     if isinstance(value, list | tuple | array.array | np.ndarray):
-        if no_arr:
-            shape = "sequence" if kind.startswith("sequence") else "array"
-            return f"<{shape} type: {kind}, length: {len(value)}>"
+        if no_arr and isinstance(kind, AbstractNestedType):
+            return _described(kind, len(value))
         shown = value if truncate is None else value[:truncate]
         items = [_plain(item, kind, truncate, no_arr, no_str) for item in shown]
         return items if len(shown) == len(value) else [*items, "..."]
@@ -77,6 +77,21 @@ def _plain(value: Any, kind: str, truncate: int | None, no_arr: bool, no_str: bo
     if isinstance(value, bytes):
         return list(value)
     return value.item() if isinstance(value, np.generic) else value
+
+
+def _described(kind: AbstractNestedType, length: int) -> str:
+    """Return what the genuine command prints in the place of an array."""
+    match kind.value_type:
+        case BasicType() as element:
+            name = element.typename
+        case NamespacedType() as element:
+            name = "/".join(element.namespaced_name())
+        case _:
+            name = "string"
+    if isinstance(kind, Array):
+        return f"<array type: {name}[{kind.size}]>"
+    bound = f"[{kind.maximum_size}]" if isinstance(kind, BoundedSequence) else ""
+    return f"<sequence type: {name}{bound}, length: {length}>"
 
 
 def parse_values(text: str) -> dict[str, Any]:
