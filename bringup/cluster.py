@@ -21,6 +21,11 @@ _RETRIES: Final = 3
 """Times that a job is done again when the process or the machine that does it dies."""
 
 
+def needs(player: Player) -> dict[str, float]:
+    """Return what `spread` is to set aside for each job of a player; Ray hides GPUs from those that ask for none."""
+    return {"cpus": float(player.threads), "gpus": float(player.device.startswith("cuda"))}
+
+
 def spread(
     function: Callable[[JobT], ResultT],
     jobs: Sequence[JobT],
@@ -128,8 +133,7 @@ def evaluate_on_cluster(
         ended.extend(results)
         on_results(ended)
 
-    gpus = float(stack.device.startswith("cuda"))
-    done = spread(_play, shares, address, cpus=stack.threads, gpus=gpus, on_result=on_result)
+    done = spread(_play, shares, address, **needs(stack), on_result=on_result)
     return [done[i % n][i // n] for i in range(len(episodes))]
 
 

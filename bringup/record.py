@@ -25,7 +25,7 @@ from typing import Annotated, NamedTuple, NoReturn
 import numpy as np
 from tyro.conf import arg
 
-from bringup.cluster import spread
+from bringup.cluster import needs, spread
 from bringup.command import Stack, import_from_here, recorded_seed
 from bringup.exploration import Disturbance, disturbed
 from bringup.options import ClusterOptions, Count, ModuleOptions, WorldOptions, one_of, whole
@@ -175,8 +175,9 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
     if job.disturbance is not None:
         policy = disturbed(policy, job.disturbance, np.random.default_rng(job.seed))
     world = World(
-        min(job.batch, len(job.episodes)), body=job.stack.body, world=job.world, time_limit=job.time_limit
-    )
+        min(job.batch, len(job.episodes)), body=job.stack.body, world=job.world, time_limit=job.time_limit,
+        threads=job.stack.threads,
+    )  # fmt: skip
     difficulties = [job.episodes.difficulty(i) for i in range(len(job.episodes))]
     recorder = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix, world=job.world)
     with StopSignal(deferred=False) as stop:
@@ -313,9 +314,12 @@ def _record_all(jobs: Sequence[Job], cluster: str | None, on_end: Callable[[int]
     if cluster is None:
         with working(jobs) as answers:
             return gather(answers, on_end)
-    cpus = jobs[0].stack.threads
-    done = spread(record_again, jobs, cluster, cpus=cpus, on_result=lambda i, ticks: on_end(len(jobs[i].episodes)))
-    return sum(done)
+    return sum(
+        spread(
+            record_again, jobs, cluster, **needs(jobs[0].stack),
+            on_result=lambda i, ticks: on_end(len(jobs[i].episodes)),
+        )
+    )  # fmt: skip
 
 
 def _job(options: Options, seed: int, part: int) -> Job:

@@ -4,10 +4,13 @@ import signal
 
 import pytest
 
+from bringup import cluster
+from bringup import record as recording
 from bringup.command import Choice, Stack
 from bringup.record import Job, MixedEpisodes, record
 from mujoban_core.plugins import ROLES
 from mujoban_core.signals import Interrupted, interruptible
+from mujoban_sim.world import World
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
 BATCH = 4
@@ -58,3 +61,31 @@ def test_a_recording_that_is_interrupted_while_levels_are_drawn_draws_no_others(
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_interruption_that_is_lost_in_a_destructor_ends_the_recording_before_it_writes(interrupted):
     assert not list(interrupted(Signalling(lost=True)).glob("*"))
+
+
+def test_a_recording_has_the_threads_of_the_networks_in_its_physics_too(tmp_path, monkeypatch):
+    asked = []
+
+    def world(*rows, **options):
+        asked.append(options["threads"])
+        return World(*rows, **options)
+
+    monkeypatch.setattr(recording, "World", world)
+    stack = Stack({role: Choice(role, "oracle") for role in ROLES}, threads=2)
+    record(Job(tmp_path, "", MixedEpisodes(1, TRAIN_SEEDS.start, [1]), stack, None, 1, 2, 0))
+    assert asked == [2]
+
+
+def test_a_recording_on_a_cluster_asks_for_the_gpu_that_it_uses(tmp_path, monkeypatch):
+    asked = []
+
+    def spread(function, jobs, address, **options):
+        asked.append((options["cpus"], options["gpus"]))
+        return [5 for _ in jobs]
+
+    monkeypatch.setattr(recording, "spread", spread)
+    for device in ("cpu", "cuda:0"):
+        stack = Stack({role: Choice(role, "oracle") for role in ROLES}, device=device, threads=3)
+        job = Job(tmp_path, "", MixedEpisodes(1, TRAIN_SEEDS.start, [1]), stack, None, 1, 2, 0)
+        assert recording._record_all([job, job], cluster.HERE, lambda _: None) == 10
+    assert asked == [(3.0, 0.0), (3.0, 1.0)]
