@@ -57,12 +57,7 @@ _QUEUE: Final = 16
 """Ticks that wait for the stream; what comes on top is dropped."""
 _EDGE: Final = 256
 """Pixels along the edge of a picture at most."""
-_MODULES: Final = {
-    topics.ABSTRACT_STATE: "estimator",
-    topics.TERMINATION: "termination",
-    topics.INSTRUCTION: "planner",
-    topics.TORQUE: "controller",
-}
+_MODULES: Final = {topic: topics.PUBLISHERS[topic.name] for topic in topics.MODULE_TOPICS}
 
 
 class _Received(NamedTuple):

@@ -71,7 +71,7 @@ class Steady:
     def __init__(self, kind: type[Message], decode: Callable[[Any], Any]) -> None:
         """Read messages whose first field is a header, by a function that leaves the header out."""
         self._kind, self._decode = kind, decode
-        self._said = b""
+        self._said: bytes | None = None
         self._content: Any = None
 
     def __call__(self, message: bytes) -> Any:

@@ -31,6 +31,8 @@ def test_what_a_steady_topic_says_is_read_once_until_it_changes():
 
 def test_a_steady_topic_refuses_what_is_no_message_and_reads_on():
     reader = Steady(AbstractState, conversions.abstract_state_from_msg)
+    with pytest.raises(ValueError, match="no serialised mujoban_msgs/msg/AbstractState"):
+        reader(state(0)[:20])
     reader(state(0, (1, 2)))
     with pytest.raises(ValueError, match="no serialised mujoban_msgs/msg/AbstractState"):
         reader(state(1)[:40])
