@@ -64,6 +64,11 @@ class Topic:
         """The type as ROS writes it, such as `sensor_msgs/msg/Image`."""
         return f"{self.type.__module__.split('.')[0]}/msg/{self.type.__name__}"
 
+    @property
+    def depth(self) -> int:
+        """Messages that are kept."""
+        return LATCHED_DEPTH if self.latched else QUEUE_DEPTH
+
     @cached_property
     def qos(self) -> QoSProfile:
         """Reliable, and deep enough that nothing is lost in lockstep."""
@@ -71,7 +76,7 @@ class Topic:
 
         return QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
-            depth=LATCHED_DEPTH if self.latched else QUEUE_DEPTH,
+            depth=self.depth,
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE,
         )

@@ -90,7 +90,7 @@ class BagWriter:
             self.path.rmdir()
             raise
         for topic in topics:
-            self._note(topic.name, topic.type_name, [qos_profile(latched=topic.latched)])
+            self._note(topic.name, topic.type_name, [qos_profile(latched=topic.latched, depth=topic.depth)])
         self._open_file()
 
     @property

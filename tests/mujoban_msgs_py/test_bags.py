@@ -56,6 +56,14 @@ def test_a_bag_gives_back_what_was_written(tmp_path, compression):
     assert bag.span == (TICK, 40 * TICK)
 
 
+def test_a_bag_carries_the_quality_of_service_of_the_graph(tmp_path):
+    bag = open_bag(write_bag(tmp_path / "bag", ticks=1))
+    said = {topic: bag.topics[topic.name].qos[0] for topic in WANTED}
+    assert {t: (q["depth"], q["durability"] == "transient_local") for t, q in said.items()} == {
+        topic: (topic.qos.depth, topic.latched) for topic in WANTED
+    }
+
+
 def test_values_are_numpy_and_topics_can_be_chosen(tmp_path):
     bag = open_bag(write_bag(tmp_path / "bag"))
     values = list(bag.read([topics.POSE.name]))
