@@ -51,7 +51,7 @@ def robot_description(body: Body) -> str:
   <link name="{topics.BODY_FRAME}">
     <visual>
       <origin xyz="0 0 {mount.height / 2}"/>
-      <geometry><cylinder radius="0.2" length="{mount.height}"/></geometry>
+      <geometry><cylinder radius="{0.2 * body.cell_size:g}" length="{mount.height}"/></geometry>
       <material name="robot"><color rgba="0.2 0.4 0.9 1"/></material>
     </visual>
   </link>

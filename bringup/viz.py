@@ -27,21 +27,25 @@ from std_msgs.msg import ColorRGBA, Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from bringup.frames import camera_transforms, robot_description, robot_transform
-from mujoban_core.bodies import BALL
-from mujoban_core.grid import CELL_SIZE, CHANNELS, TARGET, WALL, cell_to_xy
+from mujoban_core.bodies import BALL, get_body
+from mujoban_core.grid import CHANNELS, TARGET, WALL, cell_to_xy
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import Received, listen
-from mujoban_msgs_py.runtime.descriptors import NodeOptions
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
+from mujoban_sim.presets import DEFAULT_WORLD, get_world
+from mujoban_sim.scene import BOX_HALF_EXTENT
 
 PREFIX: Final = "/viz"
 PERIOD: Final = 2
 """Ticks between two messages of a topic: 10 Hz is enough for the eye."""
-_BOX_SIZE: Final = (0.8, 0.8, 0.3)
-_HEIGHTS: Final = {"wall": 0.5, "target": 0.01}
+_TARGET_HEIGHT: Final = 0.01
+"""Of a target's tile, in cells."""
+_ARROW: Final = (0.6, 0.15, 0.15)
+"""Length, width and height of the robot's arrow, in cells."""
 _COLOURS: Final = {
     "wall": (0.55, 0.5, 0.5, 1.0),
     "target": (0.8, 0.1, 0.1, 1.0),
@@ -56,11 +60,21 @@ class VizNode(GraphNode):
     Topics: `/viz/estimate/<layer>` and `/viz/ground_truth/<layer>` (nav_msgs/OccupancyGrid, percent, frame `map`) for
     the layers wall, target, agent and box; `/viz/scene` (visualization_msgs/MarkerArray); `/robot_description` (URDF);
     and, where `tf2_msgs` is installed, `/tf` and `/tf_static` (see `bringup.frames`).
+
+    Parameters:
+        body, world: Of the robot and of the physics that are shown; they decide the sizes.
     """
 
     def __init__(self, **options: Unpack[NodeOptions]) -> None:
-        """Start listening."""
+        """Start listening.
+
+        Raises:
+            ValueError: If there is no such body or world.
+        """
         super().__init__("viz", **options)
+        self._body = get_body(declare(self, "body", BALL.name, described("the robot's body", fixed=True)))
+        world = declare(self, "world", DEFAULT_WORLD, described("the physical world", fixed=True))
+        self._wall_height = get_world(world).drawn_wall_height
         self.counts: Counter[str] = Counter()
         self._pose: Pose | None = None
         self._boxes: list[Pose] = []
@@ -83,7 +97,7 @@ class VizNode(GraphNode):
         """Publish what stays as it is, for those who join at any time."""
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._description = self.create_publisher(String, "/robot_description", latched)
-        self._description.publish(String(data=robot_description(BALL)))
+        self._description.publish(String(data=robot_description(self._body)))
         self._tf: Publisher | None = None
         if find_spec("tf2_msgs") is None:
             self.get_logger().info("tf2_msgs is not installed: /tf and /tf_static are left out")
@@ -93,7 +107,7 @@ class VizNode(GraphNode):
         self._make_tf = TFMessage
         self._tf = self.create_publisher(TFMessage, "/tf", 100)
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", latched)
-        self._tf_static.publish(TFMessage(transforms=camera_transforms(BALL)))
+        self._tf_static.publish(TFMessage(transforms=camera_transforms(self._body)))
 
     def _on_pose(self, message: Received) -> None:
         self._pose = message.content.pose
@@ -121,19 +135,21 @@ class VizNode(GraphNode):
 
     def _publish_grids(self, source: str, header: Header, state: NDArray[np.float32]) -> None:
         for channel, name in enumerate(CHANNELS):
-            self._grids[source, name].publish(occupancy_grid(header, state[..., channel]))
+            self._grids[source, name].publish(occupancy_grid(header, state[..., channel], self._body.cell_size))
 
     def _markers(self, header: Header, state: NDArray[np.float32]) -> list[Marker]:
-        markers = []
-        for name, channel in (("wall", WALL), ("target", TARGET)):
-            height = _HEIGHTS[name]
-            centres = cell_to_xy(np.argwhere(state[..., channel] > 0.5))
+        markers, cell = [], self._body.cell_size
+        for name, channel, cells in (("wall", WALL, self._wall_height), ("target", TARGET, _TARGET_HEIGHT)):
+            height = cells * cell
+            centres = cell_to_xy(np.argwhere(state[..., channel] > 0.5), cell)
             poses = [_pose(x, y, height / 2) for x, y in centres]
-            markers.append(_cubes(header, name, poses, (CELL_SIZE, CELL_SIZE, height)))
-        boxes = [_pose(p.position.x, p.position.y, _BOX_SIZE[2] / 2) for p in self._boxes]
-        markers.append(_cubes(header, "box", boxes, _BOX_SIZE))
+            markers.append(_cubes(header, name, poses, (cell, cell, height)))
+        width, depth, half_height = (half * cell for half in BOX_HALF_EXTENT)
+        boxes = [_pose(p.position.x, p.position.y, half_height) for p in self._boxes]
+        markers.append(_cubes(header, "box", boxes, (2 * width, 2 * depth, 2 * half_height)))
         if self._pose is not None:
-            markers.append(_marker(header, "robot", Marker.ARROW, (0.6, 0.15, 0.15), self._pose))
+            length, breadth, thickness = (part * cell for part in _ARROW)
+            markers.append(_marker(header, "robot", Marker.ARROW, (length, breadth, thickness), self._pose))
         return markers
 
 
@@ -142,15 +158,15 @@ def map_header(header: Header) -> Header:
     return Header(stamp=header.stamp, frame_id=topics.MAP_FRAME)
 
 
-def occupancy_grid(header: Header, layer: NDArray[np.float32]) -> OccupancyGrid:
-    """Return one layer of an abstract state, [N, N], as percent per cell.
+def occupancy_grid(header: Header, layer: NDArray[np.float32], cell_size: float) -> OccupancyGrid:
+    """Return one layer of an abstract state, [N, N], as percent per cell of `cell_size` metres.
 
     An occupancy grid begins in the south-west; row 0 of an abstract state is north.
     """
     rows, columns = layer.shape
-    corner = Point(x=-columns * CELL_SIZE / 2, y=-rows * CELL_SIZE / 2)
+    corner = Point(x=-columns * cell_size / 2, y=-rows * cell_size / 2)
     percent = np.rint(100 * layer[::-1]).astype(np.int8)
-    info = MapMetaData(resolution=CELL_SIZE, width=columns, height=rows, origin=Pose(position=corner))
+    info = MapMetaData(resolution=cell_size, width=columns, height=rows, origin=Pose(position=corner))
     info.map_load_time = header.stamp
     return OccupancyGrid(header=map_header(header), info=info, data=array("b", percent.tobytes()))
 

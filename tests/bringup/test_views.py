@@ -3,6 +3,7 @@
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from geometry_msgs.msg import Pose
 from mujoban_msgs.msg import EpisodeTruth, Instruction
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
@@ -15,12 +16,14 @@ from bringup.overlay import BAR, CELL, COLOURS, MARGIN, grid_picture
 from bringup.stack import top_camera_size
 from bringup.video import EDGE, VideoNode
 from bringup.viz import VizNode, occupancy_grid
+from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import AGENT, BOX, TARGET, WALL, cell_to_xy
 from mujoban_core.plugins import AGENT as AGENT_ROLE
 from mujoban_core.plugins import ROLES
 from mujoban_msgs_py import conversions, topics
 from mujoban_sim.observation import GLANCE
+from mujoban_sim.presets import get_world
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.levels import Level
 
@@ -46,7 +49,7 @@ class Listener(Node):
 def test_an_occupancy_grid_begins_in_the_south_west():
     layer = np.zeros((10, 10), np.float32)
     layer[9, 0], layer[0, 9] = 1.0, 0.25
-    grid = occupancy_grid(conversions.header(0), layer)
+    grid = occupancy_grid(conversions.header(0), layer, 1.0)
     percent = np.array(grid.data).reshape(grid.info.height, grid.info.width)
     assert percent[0, 0] == 100 and percent[9, 9] == 25 and percent.sum() == 125
     south_west = cell_to_xy((9, 0))
@@ -145,3 +148,21 @@ def test_the_view_from_above_has_as_many_pixels_to_a_metre_with_every_body():
     assert top_camera_size(Stack(modules, body="ant"), filmed=True) == EDGE
     agent = Solo(Choice.parse(AGENT_ROLE, "random"), body="ant")
     assert top_camera_size(agent, filmed=True) == FRAME_SIZE, "it may look at it"
+
+
+def test_the_scene_has_the_sizes_of_the_body_and_the_world(ros):
+    chosen = {"body": "ant", "world": "reference"}
+    node = VizNode(parameter_overrides=[Parameter(name, value=value) for name, value in chosen.items()])
+    try:
+        cell = get_body("ant").cell_size
+        node._boxes = [Pose()]
+        state = np.zeros((10, 10, 4), np.float32)
+        state[0, 9, WALL] = 1.0
+        markers = {marker.ns: marker for marker in node._markers(conversions.header(0), state)}
+        wall, box = markers["wall"], markers["box"]
+        assert (wall.scale.x, wall.scale.z) == (cell, get_world("reference").drawn_wall_height * cell)
+        assert (wall.points[0].x, wall.points[0].y) == tuple(cell_to_xy((0, 9), cell))
+        assert (box.scale.x, box.scale.z) == pytest.approx((0.8 * cell, 0.3 * cell))
+        assert occupancy_grid(conversions.header(0), state[..., WALL], cell).info.resolution == np.float32(cell)
+    finally:
+        node.destroy_node()
