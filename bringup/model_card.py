@@ -54,7 +54,7 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "The camera frame, proprioception, the instruction and its own last answer. No pose, no ground truth.",
         "Relies on dead reckoning: a robot that slips for long, or is moved, misleads it. Knows no box that it "
         "does not see.",
-        "the completion is declared after 120 ticks; dead reckoning and the instruction's frame feed it",
+        "an instruction ends after 120 ticks at the latest; dead reckoning and the instruction's frame feed it",
         {"": "supervised, by the rule of completion in recorded bags"},
         "estimator",
     ),
