@@ -33,17 +33,20 @@ PER_TICK: Final = 2
 """Evaluations in a tick by default: 8 ms of the 50 ms between two ticks."""
 CERTAINTY: Final = 0.9
 """Probability by default with which all must be as it seems that a plan rests on."""
+_LIKELIER: Final = 0.5
+"""Probability above which a wall or a box is taken for one, whatever certainty is asked for."""
 _NO_KEY: Final = -1
-_OWN: Final = 6
+_OWN: Final = 5
 """Arrays of the memory before those of the planner alone."""
 
 
 class LookAheadPlanner(Planner):
     """Searches when it has no plan for the state that it finds, follows the plan while the world does.
 
-    A plan is thrown away when the boxes or the robot are not where it expects them, when a wall appears on its way,
-    when the targets change, or when a planned move keeps failing. Where the search finds nothing, or what it found
-    rests on what is not known well enough, the learned planner decides alone.
+    A plan is thrown away when the boxes or the robot are not where it expects them, when the targets change, when what
+    the rest of it needs is no longer certain (boxes, targets, and neither wall nor box on the way), or when a planned
+    move keeps failing. Where the search finds nothing, or what it found is not certain, the learned planner decides
+    alone.
     """
 
     def __init__(
@@ -80,13 +83,12 @@ class LookAheadPlanner(Planner):
     def initial_memory(self, batch: int) -> Memory:
         """Return the memory at the start of `batch` episodes.
 
-        It holds the plan, its cursor, the state that it continues from, the squares that must be free for it and the
-        targets that it leads to, the search (None or a `LoneSearch`, which goes on), and the planner's memory.
+        It holds the plan, its cursor, the state that it continues from, the targets that it leads to, the search (None
+        or a `LoneSearch`, which goes on), and the planner's memory.
         """
         plan = np.zeros((batch, MOVE_LIMIT + 1), np.int64)
-        expected = np.zeros(batch, np.int64), np.full(batch, _NO_KEY, np.int64)
-        grounds = np.zeros(batch, np.uint64), np.zeros(batch, np.uint64)
-        return (plan, *expected, *grounds, np.full(batch, None, object), *self.planner.initial_memory(batch))
+        expected = np.zeros(batch, np.int64), np.full(batch, _NO_KEY, np.int64), np.zeros(batch, np.uint64)
+        return (plan, *expected, np.full(batch, None, object), *self.planner.initial_memory(batch))
 
     def think(self, abstract_state: NDArray[np.float32], memory: Memory) -> Memory:
         """Go on with the searches."""
@@ -97,16 +99,20 @@ class LookAheadPlanner(Planner):
     def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
         """Return an instruction for each state, [M] from [M, N, N, 4], and the next memory; errors as the planner's."""
         check_abstract_state(abstract_state)
-        plan, cursor, expected, ground, target, searches = (np.array(x) for x in memory[:_OWN])
+        plan, cursor, expected, target, searches = (np.array(x) for x in memory[:_OWN])
         visits, means = split_memory(memory[_OWN:])
         boards, every = likeliest_boards(abstract_state), np.arange(len(plan))
-        holds = (state_keys(abstract_state) == expected) & (plan[every, cursor] != 0)
-        holds &= (boards.target == target) & (boards.wall & ground == NONE)
+        holds = (state_keys(abstract_state) == expected) & (plan[every, cursor] != 0) & (boards.target == target)
+        for row in np.flatnonzero(holds).tolist():
+            rest = plan[row, cursor[row] :]
+            holds[row] = self._is_certain(abstract_state[row], boards, row, rest[rest != 0])
         plan[~holds], cursor[~holds] = 0, 0
         lost = np.flatnonzero(~holds)
         self._search(boards, lost, searches)
         for row in lost.tolist():
-            self._adopt(abstract_state[row], boards, row, searches[row], plan, ground)
+            found = searches[row].solution(int(boards.agent[row]))
+            if 0 < len(found) <= MOVE_LIMIT and self._is_certain(abstract_state[row], boards, row, found):
+                plan[row, : len(found)] = found
         target = np.where(holds, target, boards.target)
         planned = plan[every, cursor]
         counts = count_visits(abstract_state, visits)
@@ -121,7 +127,7 @@ class LookAheadPlanner(Planner):
         visits = remember(abstract_state, decision, visits)
         cursor = np.where(alone, 0, cursor + 1)
         expected = np.where(alone, _NO_KEY, _next_keys(abstract_state, decision))
-        return decision, (plan, cursor, expected, ground, target, searches, *visits, *means)
+        return decision, (plan, cursor, expected, target, searches, *visits, *means)
 
     def _advance(self, searches: NDArray[Any]) -> None:
         steps = self.expansions if self.per_tick is None else self.per_tick
@@ -136,29 +142,21 @@ class LookAheadPlanner(Planner):
                 searches[row] = LoneSearch(here, self.expansions, MOVE_LIMIT)
         self._advance(searches[rows])
 
-    def _adopt(
-        self,
-        state: NDArray[np.float32],
-        boards: BitBoards,
-        row: int,
-        search: LoneSearch,
-        plan: NDArray[np.int64],
-        ground: NDArray[np.uint64],
-    ) -> None:
-        """Write a plan that was found for a state, [N, N, 4], into `plan` and `ground`, if it is certain enough."""
-        instructions = search.solution(int(boards.agent[row]))
-        if not 0 < len(instructions) <= MOVE_LIMIT:
-            return
+    def _is_certain(
+        self, state: NDArray[np.float32], boards: BitBoards, row: int, instructions: NDArray[np.int64]
+    ) -> bool:
+        """Return whether all is certain that instructions rest on in a state, [N, N, 4]: boxes, targets, a free way."""
         needed = _squares_used(boards.box[row], int(boards.agent[row]), instructions)
         inner = state[1:-1, 1:-1].reshape(-1, state.shape[-1])
         used, target, box = (
             np.unpackbits(np.array([squares], "<u8").view(np.uint8), bitorder="little").astype(np.bool_)
             for squares in (needed, boards.target[row], boards.box[row])
         )
-        doubt = 1.0 - self.certainty
-        known = (inner[used, WALL] <= doubt).all() and (inner[target, TARGET] >= self.certainty).all()
-        if known and (inner[box, BOX] >= self.certainty).all():
-            plan[row, : len(instructions)], ground[row] = instructions, needed
+        used[int(boards.agent[row])] = False  # nothing stands where the robot does
+        doubt = min(1.0 - self.certainty, _LIKELIER)
+        free = (inner[used, WALL] <= doubt).all() and (inner[used & ~box, BOX] <= doubt).all()
+        there = (inner[box, BOX] >= self.certainty).all() and (inner[target, TARGET] >= self.certainty).all()
+        return bool(free and there)
 
     def _choose(
         self, states: NDArray[np.float32], rows: NDArray[np.int64], counts: VisitCounts, means: PushMeans

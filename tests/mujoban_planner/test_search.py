@@ -71,12 +71,6 @@ def test_a_planned_move_that_keeps_failing_is_given_up(planner):
     assert len(set(tried)) > 1
 
 
-def walls_of(levels, first, last):
-    states = abstract_states(levels)
-    states[..., 0] = np.where(states[..., 0] > 0.5, last, first)
-    return states
-
-
 def play_with_ticks(player, levels, ticks, limit=100):
     """Play a level in which every instruction takes so many ticks; return decisions, and whether it was solved."""
     state, decisions = player.initial_state(np.zeros(1, np.int64)), []
@@ -123,25 +117,47 @@ def _pushes(levels, decisions):
     return moved
 
 
-def test_a_plan_that_rests_on_what_is_not_known_is_not_followed_and_a_wall_on_its_way_ends_it(planner):
-    levels = take_levels(generate_batch(2, range(2)), np.array([0]))
+def first_plan(planner, states):
+    """Return the plan for the first state of an episode, zeros where there is none, and the memory."""
     player = LookAheadPlanner(planner, 400)
-    start = player.initial_state(np.zeros(1, np.int64)).memory
-    decision, memory = player.decide(abstract_states(levels), start)
-    assert memory[0].any()
-    _, vague = player.decide(walls_of(levels, 0.2, 1.0), start)
-    assert not vague[0].any()
-    result = rules.apply(*levels, decision)
-    states = abstract_states(levels._replace(boxes=result.boxes, player=result.player))
-    _, kept = player.decide(states, memory)
-    assert (kept[0] == memory[0]).all()
-    used = (int(memory[3][0]) >> np.arange(64)) & 1
-    box = int(bit_boards(levels).box[0])
-    here = int(states[0, 1:-1, 1:-1, 2].argmax())
-    blocked = next(c for c in np.flatnonzero(used) if not box >> int(c) & 1 and c != here)
-    states[0, 1 + blocked // 8, 1 + blocked % 8, 0] = 1.0
-    _, after = player.decide(states, memory)
-    assert not (after[0] == memory[0]).all()
+    decision, memory = player.decide(states, player.initial_state(np.zeros(1, np.int64)).memory)
+    return memory[0][0], decision, memory
+
+
+CORRIDOR = Level.from_text("########\n#@$  .##\n########")
+AHEAD, TARGET_CELL, BOX_CELL = (4, 5), (4, 6), (4, 3)
+
+
+def corridor(cell=None, channel=0, probability=0.0, level=CORRIDOR):
+    """Return the abstract state of the corridor, in which one probability is another."""
+    states = abstract_states(stack_levels([level]))
+    if cell is not None:
+        states[0, *cell, channel] = probability
+    return states
+
+
+@pytest.mark.parametrize(
+    ("cell", "channel", "vague", "known"),
+    [(AHEAD, 0, 0.2, 0.05), (AHEAD, 3, 0.45, 0.05), (TARGET_CELL, 1, 0.6, 0.95), (BOX_CELL, 3, 0.6, 0.95)],
+    ids=["wall", "box in the way", "target", "box"],
+)
+def test_a_plan_is_followed_only_while_all_that_it_needs_is_certain(planner, cell, channel, vague, known):
+    player = LookAheadPlanner(planner, 400)
+    assert not first_plan(planner, corridor(cell, channel, vague))[0].any()
+    plan, decision, memory = first_plan(planner, corridor(cell, channel, known))
+    assert decision[0] == plan[0] and np.count_nonzero(plan) == 3
+    pushed = Level.from_text("########\n# @$ .##\n########")
+    cell = (4, 4) if cell == BOX_CELL else cell
+    for probability, kept in ((known, True), (vague, False)):
+        _, after = player.decide(corridor(cell, channel, probability, pushed), memory)
+        assert (after[0] == memory[0]).all() == kept
+
+
+def test_what_a_plan_has_left_behind_need_not_be_certain(planner):
+    _, _, memory = first_plan(planner, corridor())
+    states = corridor((4, 2), 3, 0.4, Level.from_text("########\n# @$ .##\n########"))
+    _, after = LookAheadPlanner(planner, 400).decide(states, memory)
+    assert (after[0] == memory[0]).all()
 
 
 def test_only_the_learned_planner_can_look_ahead(planner):
