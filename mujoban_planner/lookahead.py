@@ -23,7 +23,7 @@ from mujoban_core.interfaces import Memory, Module, Planner, put_rows, take_rows
 from mujoban_planner import MOST_EVALUATIONS
 from mujoban_planner.abstract_env import MOVE_LIMIT, AbstractEnvironment
 from mujoban_planner.boards import BitBoards, likeliest_boards, state_tensor
-from mujoban_planner.decision import PushMeans, VisitCounts, count_visits, recall, remember, state_keys
+from mujoban_planner.decision import PushMeans, VisitCounts, VisitMemory, count_visits, recall, remember, state_keys
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state, split_memory
 from mujoban_planner.search import LoneSearch, advance
 from mujoban_planner.teacher import possible_pushes
@@ -36,7 +36,7 @@ CERTAINTY: Final = 0.9
 _LIKELIER: Final = 0.5
 """Probability above which a wall or a box is taken for one, whatever certainty is asked for."""
 _NO_KEY: Final = -1
-_OWN: Final = 5
+_OWN: Final = 6
 """Arrays of the memory before those of the planner alone."""
 
 
@@ -77,18 +77,20 @@ class LookAheadPlanner(Planner):
             )
         self.planner, self.expansions, self.per_tick, self.certainty = planner, expansions, per_tick, certainty
         self.thinks = per_tick is not None
+        self._patience = 0 if per_tick is None else -(-expansions // per_tick)  # decisions that a search may take
         self.evaluations = 0
         """Network evaluations by searches so far."""
 
     def initial_memory(self, batch: int) -> Memory:
         """Return the memory at the start of `batch` episodes.
 
-        It holds the plan, its cursor, the state that it continues from, the targets that it leads to, the search (None
-        or a `LoneSearch`, which goes on), and the planner's memory.
+        It holds the plan, its cursor, the state that it continues from, the targets that it leads to, how often the robot
+        has waited since its last push, the search (None or a `LoneSearch`, which goes on), and the planner's memory.
         """
         plan = np.zeros((batch, MOVE_LIMIT + 1), np.int64)
         expected = np.zeros(batch, np.int64), np.full(batch, _NO_KEY, np.int64), np.zeros(batch, np.uint64)
-        return (plan, *expected, np.full(batch, None, object), *self.planner.initial_memory(batch))
+        waits = np.zeros(batch, np.int64)
+        return (plan, *expected, waits, np.full(batch, None, object), *self.planner.initial_memory(batch))
 
     def think(self, abstract_state: NDArray[np.float32], memory: Memory) -> Memory:
         """Go on with the searches."""
@@ -99,7 +101,7 @@ class LookAheadPlanner(Planner):
     def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
         """Return an instruction for each state, [M] from [M, N, N, 4], and the next memory; errors as the planner's."""
         check_abstract_state(abstract_state)
-        plan, cursor, expected, target, searches = (np.array(x) for x in memory[:_OWN])
+        plan, cursor, expected, target, waits, searches = (np.array(x) for x in memory[:_OWN])
         visits, means = split_memory(memory[_OWN:])
         boards, every = likeliest_boards(abstract_state), np.arange(len(plan))
         holds = (state_keys(abstract_state) == expected) & (plan[every, cursor] != 0) & (boards.target == target)
@@ -121,13 +123,19 @@ class LookAheadPlanner(Planner):
         decision = planned.copy()
         if alone.any():
             rows = np.flatnonzero(alone)
-            chosen, means = self._choose(abstract_state, rows, counts, means)
-            decision[rows] = self._wait(chosen, rows, boards, searches, counts)
+            decision[rows], means = self._choose(abstract_state, rows, counts, means)
             plan[alone] = 0
-        visits = remember(abstract_state, decision, visits)
+        pushes = possible_pushes(boards) >> decision & 1 == 1
+        # What is put off while a search may find better was not tried; not for ever where estimates flicker.
+        waiting = alone & pushes & (waits < self._patience) & _searching(searches)
+        decision[waiting] = Instruction.STAY
+        waits = np.where(waiting, waits + 1, np.where(pushes, 0, waits))
+        acting = np.flatnonzero(~waiting)
+        acted = remember(abstract_state[acting], decision[acting], VisitMemory(*take_rows(visits, acting)))
+        visits = put_rows(visits, acting, acted)
         cursor = np.where(alone, 0, cursor + 1)
         expected = np.where(alone, _NO_KEY, _next_keys(abstract_state, decision))
-        return decision, (plan, cursor, expected, target, searches, *visits, *means)
+        return decision, (plan, cursor, expected, target, waits, searches, *visits, *means)
 
     def _advance(self, searches: NDArray[Any]) -> None:
         steps = self.expansions if self.per_tick is None else self.per_tick
@@ -166,22 +174,6 @@ class LookAheadPlanner(Planner):
         chosen, after = self.planner.choose(states[rows], VisitCounts(*take_rows(counts, rows)), before)
         return chosen, PushMeans(*put_rows(means, rows, after))
 
-    def _wait(
-        self,
-        chosen: NDArray[np.int64],
-        rows: NDArray[np.int64],
-        boards: BitBoards,
-        searches: NDArray[Any],
-        counts: VisitCounts,
-    ) -> NDArray[np.int64]:
-        """Return STAY in place of pushes while a search may find better; not for ever where estimates flicker."""
-        if self.per_tick is None:
-            return chosen
-        searching = np.array([search is not None and search.open for search in searches[rows]])
-        pushing = possible_pushes(BitBoards._make(column[rows] for column in boards)) >> chosen & 1 == 1
-        patient = counts.since_arrival[rows, Instruction.STAY] < -(-self.expansions // self.per_tick)
-        return np.where(searching & pushing & patient, int(Instruction.STAY), chosen)
-
 
 def look_ahead(module: Module, expansions: int) -> Module:
     """Return a planner that looks ahead while the robot walks; itself for 0.
@@ -194,6 +186,11 @@ def look_ahead(module: Module, expansions: int) -> Module:
     if not isinstance(module, LearnedPlanner):
         raise ValueError(f"look-ahead with a {type(module).__name__}: expected the learned planner, which guides it")
     return LookAheadPlanner(module, expansions, per_tick=PER_TICK)
+
+
+def _searching(searches: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which searches, None for none, may still find a solution."""
+    return np.array([search is not None and search.open for search in searches], np.bool_)
 
 
 @njit(cache=True, nogil=True)

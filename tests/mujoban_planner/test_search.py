@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 import torch
 
+from mujoban_core.grid import Instruction
 from mujoban_core.program import exit_status
 from mujoban_planner import evaluate
 from mujoban_planner.boards import abstract_states, bit_boards, take_levels
 from mujoban_planner.lookahead import LookAheadPlanner, look_ahead
 from mujoban_planner.networks import ResidualPlanner
+from mujoban_planner.planner import split_memory
 from mujoban_planner.play import play
 from mujoban_planner.search import advance, search
 from mujoban_sokoban import rules
@@ -107,6 +109,20 @@ def test_a_robot_that_looks_ahead_waits_before_a_push_until_the_search_has_ended
     decisions, _ = play_with_ticks(player, levels, ticks=1, limit=200)
     pushed = next(i for i, d in enumerate(decisions) if d and _pushes(levels, decisions[: i + 1]))
     assert 0 in decisions[:pushed] or pushed >= 60
+
+
+def test_a_robot_waits_for_one_search_at_most_where_estimates_flicker_and_forgets_nothing_meanwhile(planner, monkeypatch):
+    lines = ("########\n#@$  . #\n#      #\n#  $ . #\n########", "########\n#@$  . #\n#  $   #\n#    . #\n########")
+    states = [abstract_states(stack_levels([Level.from_text(text)])) for text in lines]
+    player = LookAheadPlanner(planner, 300, per_tick=1)
+    pushing = np.array([Instruction.EAST])
+    monkeypatch.setattr(planner, "choose", lambda states, counts, means: (pushing, means))
+    decisions, memory = [], player.initial_state(np.zeros(1, np.int64)).memory
+    for tick in range(310):
+        decision, memory = player.decide(states[tick % 2], memory)
+        decisions.append(int(decision[0]))
+    assert decisions == [Instruction.STAY] * 300 + [Instruction.EAST] + [Instruction.STAY] * 9
+    assert split_memory(memory[6:])[0].count[0] == 1, "what was put off was not tried"
 
 
 def _pushes(levels, decisions):
