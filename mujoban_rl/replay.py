@@ -90,13 +90,19 @@ class SequenceReplay:
         return State({"added": self.added}, held)
 
     def restore(self, state: State) -> None:
-        """Take over what `state` of a replay of the same size returned."""
-        self.added = state.values["added"]
+        """Take over what `state` of a replay of any capacity returned: of more than fit, the newest.
+
+        Raises:
+            ValueError: If its sequences have another length.
+        """
         self._fields = {}
-        for name, held in state.tensors.items():
-            values = held.numpy()
-            self._fields[name] = np.zeros((self.capacity, *values.shape[1:]), values.dtype)
-            self._fields[name][: len(values)] = values
+        count = len(next(iter(state.tensors.values()), ()))
+        added = state.values["added"]
+        # Of the same capacity all comes to where it was; a larger one has held no more than this.
+        self.added = added - count if count >= self.capacity else 0
+        if count:
+            oldest_first = (added + np.arange(count)) % count
+            self.add({name: held.numpy()[oldest_first].swapaxes(0, 1) for name, held in state.tensors.items()})
 
 
 class SequenceBuilder:

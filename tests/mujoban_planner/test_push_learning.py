@@ -65,22 +65,37 @@ def test_the_loss_teaches_the_push_head_and_the_trunk_but_no_other_head(make, tm
     assert not {"readout.policy", "readout.dead", "readout.push_dead", "readout.walk", "readout.plan"} & changed
 
 
+def deliver(replay, source, number, actor=0):
+    """Add four pushes in each level; the target tells where they come from, the wall which pushes they are."""
+    mark = np.arange(4 * number, 4 * number + 5, dtype=np.uint64)[:, None].repeat(16, 1)
+    boards = {"wall": mark, "target": np.full_like(mark, source), "box": mark, "agent": mark.astype(np.uint8)}
+    arrays = {name: values[:4] for name, values in boards.items()}
+    arrays |= {f"last_{name}": values[4] for name, values in boards.items()}
+    arrays |= {"push": np.zeros((4, 16), np.int64), "reward": np.zeros((4, 16), np.float32)}
+    replay.add(Experience(arrays | {"over": np.zeros((4, 16), bool)}, 64, actor=actor))
+
+
+def test_a_replay_goes_on_with_more_or_fewer_actors():
+    config = PushMPOConfig(play=PLAY, batch_size=400, replay_steps=8, n_step=3, **SIZE)
+    replay = PushReplay(config, 1)
+    for number in range(1, 8):
+        deliver(replay, 5, number)
+    more, fewer = PushReplay(config, 2), PushReplay(config, 1)
+    more.restore(replay.state())
+    deliver(more, 6, 1, actor=1)
+    assert set(more.sample()["target"].flatten().tolist()) == {5}, "nothing but what was played"
+    deliver(more, 6, 2, actor=1)
+    assert set(more.sample()["target"].flatten().tolist()) == {5, 6}
+    fewer.restore(more.state())
+    assert len(fewer.replay) == len(replay.replay) and fewer.sample()["wall"].min() > 0
+
+
 def test_no_return_runs_from_the_levels_of_an_actor_that_died_into_those_of_its_successor():
     config = PushMPOConfig(play=PLAY, batch_size=400, n_step=3, **SIZE)
     replay = PushReplay(config, 1)
-
-    def deliver(actor, number):
-        # The target tells which actor it is, the wall which of its pushes.
-        mark = np.arange(4 * number, 4 * number + 5, dtype=np.uint64)[:, None].repeat(16, 1)
-        boards = {"wall": mark, "target": np.full_like(mark, actor), "box": mark, "agent": mark.astype(np.uint8)}
-        arrays = {name: values[:4] for name, values in boards.items()}
-        arrays |= {f"last_{name}": values[4] for name, values in boards.items()}
-        arrays |= {"push": np.zeros((4, 16), np.int64), "reward": np.zeros((4, 16), np.float32)}
-        replay.add(Experience(arrays | {"over": np.zeros((4, 16), bool)}, 64))
-
     for actor in range(2):
         for number in range(3):
-            deliver(actor, number)
+            deliver(replay, actor, number)
     window = replay.sample()
     assert set(window["target"].flatten().tolist()) == {0, 1}
     assert torch.equal(window["target"][:, 1:], window["target"][:, :-1])

@@ -37,6 +37,19 @@ def test_a_replay_and_a_builder_go_on_where_they_were():
     assert torch.equal(one["value"], two["value"]) and torch.equal(one["frame"], two["frame"])
 
 
+@pytest.mark.parametrize(("capacity", "kept"), [(3, range(6, 9)), (5, range(4, 9)), (20, range(4, 9))])
+def test_a_replay_of_another_capacity_goes_on_with_the_newest_of_what_was_held(capacity, kept):
+    full, other = SequenceReplay(5, 1), SequenceReplay(capacity, 1)
+    for value in range(9):
+        full.add({"value": np.array([[value]])})
+    other.restore(full.state())
+    assert len(other) == len(kept)
+    assert set(other.sample(300, torch.Generator().manual_seed(0))["value"].flatten().tolist()) == set(kept)
+    for value in range(9, 9 + capacity):
+        assert other.sample(300, torch.Generator().manual_seed(0))["value"].min() == max(4, value - capacity)
+        other.add({"value": np.array([[value]])})
+
+
 def test_the_last_sequences_stay_where_more_come_than_fit():
     replay = SequenceReplay(2, 1)
     replay.add({"value": np.arange(5)[None]})
