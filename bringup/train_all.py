@@ -175,12 +175,13 @@ def _controller(options: Options) -> list[Stage]:
 
 def _planner(options: Options) -> list[Stage]:
     """Return the stages of the planner: boards in full view, then also boards as an estimator sees them."""
-    method = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.seed), "--evaluate-every", "900")
+    method = ("mujoban_planner.train", "expert-iteration", "--evaluate-every", "900")
+    first, second = (("--seed", str(2 * options.seed + i)) for i in range(2))  # each has levels of its own
     whole = PRODUCTS["whole"]
     views = ("--init", str(options.run / whole), "--learning-rate", "7e-4", *_VIEWS)
     return [
-        _trainer(options, "planner", (*method, *_from_before(options, "--init", "whole")), whole),
-        _trainer(options, "planner_views", (*method, *views), WEIGHTS["planner"], "planner"),
+        _trainer(options, "planner", (*method, *first, *_from_before(options, "--init", "whole")), whole),
+        _trainer(options, "planner_views", (*method, *second, *views), WEIGHTS["planner"], "planner"),
     ]
 
 

@@ -58,7 +58,7 @@ def expert_iteration(
         RunError: If the directory belongs to another run.
     """
     source = ActorSource(
-        (actors or ActorOptions()).pool(partial(SearchActor, config.network, config.search)),
+        (actors or ActorOptions()).pool(partial(SearchActor, config.network, config.search, config.seed)),
         LessonStore(config.search, config.seed),
         steps_per_update=config.evaluations * config.search.batch_size,
         first_steps=config.first_evaluations,

@@ -18,13 +18,12 @@ from torch import Tensor
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
+from mujoban_planner.training_levels import stream_number
 from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares
 from mujoban_rl.actors import Actor, ActorPool, Experience
 from mujoban_rl.engine import Source, State
 
-_STREAMS: Final = 1000
-"""Streams of levels that one seed may use up, one for each actor."""
 _KINDS: Final = ("demonstrations", "corrections")
 
 
@@ -78,7 +77,7 @@ class LessonActor(Actor):
         self._planner.lay_out()
         mix = difficulty_shares(config.mix)
         self._maker = LessonMaker(
-            _STREAMS * config.seed + stream, mix, config.judged, long=config.long, long_moves=config.long_moves
+            stream_number(config.seed, stream), mix, config.judged, long=config.long, long_moves=config.long_moves
         )
         self._version = 0
         self._ahead = 0  # demonstrations less corrections, since there are any of these

@@ -18,7 +18,7 @@ from mujoban_core.grid import DIFFICULTIES
 from mujoban_planner.boards import BitBoards
 from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.push_policy import PushPolicy
-from mujoban_planner.training_levels import Ticket, TrainingLevels
+from mujoban_planner.training_levels import Ticket, TrainingLevels, stream_number
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
@@ -46,18 +46,23 @@ class PushActor(Actor):
     `over` (nothing follows) and `log_prob`; and the states after the last pushes, `last_wall` and so on, [E].
     """
 
-    def __init__(self, network: NetworkConfig, config: PlayConfig, stream: int) -> None:
+    def __init__(self, network: NetworkConfig, config: PlayConfig, seed: int, stream: int) -> None:
         """Start levels.
 
         Args:
             network: What to build for the weights that it plays with.
             config: How to play.
-            stream: Of levels and randomness.
+            seed: Of the run.
+            stream: Of levels and randomness; those of another seed are others.
+
+        Raises:
+            ValueError: If the stream has no training seeds.
         """
+        number = stream_number(seed, stream)
         self.policy, self.config = PushPolicy(network.build(), untaught=True).eval(), config
         self.policy.planner.lay_out()
-        self._levels = TrainingLevels(stream)
-        self._generator = torch.Generator().manual_seed(stream)
+        self._levels = TrainingLevels(number)
+        self._generator = torch.Generator().manual_seed(number)
         self._environment = PushEnvironment(config.environments)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.environments
         self._reset(np.arange(config.environments))

@@ -207,7 +207,7 @@ def push_mpo(
     """Return the trainer of a run of MPO over pushes, resumed if there is one in the directory."""
     options = actors or ActorOptions()
     source = ActorSource(
-        options.pool(partial(PushActor, config.network, config.play)),
+        options.pool(partial(PushActor, config.network, config.play, config.seed)),
         PushReplay(config, options.num_actors),
         steps_per_update=config.batch_size / config.reuse,
         first_steps=config.first_steps,

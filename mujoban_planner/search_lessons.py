@@ -30,7 +30,7 @@ from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, m
 from mujoban_planner.search import grow
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import DEAD_SHARE, judge_instructions, label_dead, label_demonstrations, possible_pushes
-from mujoban_planner.training_levels import Ticket, TrainingLevels
+from mujoban_planner.training_levels import Ticket, TrainingLevels, stream_number
 from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Actor, Experience
@@ -100,22 +100,27 @@ class SearchActor(Actor):
     off them, with what was proved there, under `verdict.`.
     """
 
-    def __init__(self, network: NetworkConfig, config: SearchConfig, stream: int) -> None:
+    def __init__(self, network: NetworkConfig, config: SearchConfig, seed: int, stream: int) -> None:
         """Start without a search.
 
         Args:
             network: What to build for the weights that guide the searches.
             config: What defines the searches.
-            stream: Of levels and randomness.
+            seed: Of the run.
+            stream: Of levels and randomness; those of another seed are others.
+
+        Raises:
+            ValueError: If the stream has no training seeds.
         """
+        number = stream_number(seed, stream)
         self.planner, self.config = network.build().eval(), config
         self.planner.lay_out()
-        self._levels = TrainingLevels(stream, retried=config.retried, retries=config.retries)
+        self._levels = TrainingLevels(number, retried=config.retried, retries=config.retries)
         self._forest = Forest(config.trees, (config.expansions << config.retries) + config.questions, MOVE_LIMIT)
         self._budgets = np.zeros(config.trees, np.int64)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
         self._leads = [_Lead(playing=False) for _ in range(config.trees)]
-        self._rng = np.random.default_rng([stream, 4])
+        self._rng = np.random.default_rng([number, 4])
 
     def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
         """Guide by newer weights."""

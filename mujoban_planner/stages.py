@@ -120,7 +120,8 @@ def train_stages(
     folders = []
     for i, (method, share) in enumerate(config.parsed, 1):
         folders.append(directory / f"{i}_{method}")
-        settings = _Settings(config.channels, config.blocks, init, config.seed, share * config.cpu_seconds)
+        seed = len(config.parsed) * config.seed + i - 1  # each stage has levels of its own
+        settings = _Settings(config.channels, config.blocks, init, seed, share * config.cpu_seconds)
         trainer = METHODS[method](settings, _Place(folders[-1], cadence, actors))
         product = folders[-1] / _PRODUCT
         if trainer.complete and product.exists():

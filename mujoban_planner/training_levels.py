@@ -16,6 +16,8 @@ from mujoban_planner.boards import BitBoards, bit_boards
 from mujoban_rl.engine import State
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 
+_STREAMS_PER_SEED: Final = 1000
+"""Streams of levels that one seed may use up, one for each actor."""
 _SEEDS_PER_STREAM: Final = 10**12
 _MEMORY: Final = 0.995
 """What a solve rate keeps of itself when one more level of its difficulty ends."""
@@ -29,6 +31,17 @@ _LATE_SHARE: Final = 0.9
 """Share of the hardest difficulty then; the one below it has the rest."""
 _KEPT_FAILURES: Final = 20_000
 _STREAMS: Final = TRAIN_SEEDS.start + 700_000 * _SEEDS_PER_STREAM
+
+
+def stream_number(seed: int, stream: int) -> int:
+    """Return which of all runs' streams an actor has: the `stream`-th of a run with this seed.
+
+    Raises:
+        ValueError: If the seed is negative, or has no such stream.
+    """
+    if seed < 0 or not 0 <= stream < _STREAMS_PER_SEED:
+        raise ValueError(f"stream {stream} of seed {seed}: expected 0 to {_STREAMS_PER_SEED - 1} of a seed from 0 on")
+    return _STREAMS_PER_SEED * seed + stream
 
 
 class Ticket(NamedTuple):
@@ -59,8 +72,8 @@ class TrainingLevels:
             ValueError: If the stream has no training seeds.
         """
         self._next = _STREAMS + stream * _SEEDS_PER_STREAM
-        if stream < 0 or self._next not in TRAIN_SEEDS:
-            raise ValueError(f"stream {stream}: expected a number whose seeds lie in {TRAIN_SEEDS}")
+        if stream < 0 or self._next + _SEEDS_PER_STREAM - 1 not in TRAIN_SEEDS:
+            raise ValueError(f"stream {stream}: expected a number whose seeds lie in {TRAIN_SEEDS}, as of a small seed")
         self._rng = np.random.default_rng([stream, 3])
         self._retried, self._retries = retried, retries
         self._solved, self._tried = np.zeros((2, len(DIFFICULTIES)))

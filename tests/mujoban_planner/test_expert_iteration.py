@@ -35,7 +35,7 @@ SMALL = SearchConfig(trees=16, expansions=20, buffer=4000, steps=16, batch_size=
 def lessons():
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    actor, store = SearchActor(NETWORK, SMALL, 0), LessonStore(SMALL, 0)
+    actor, store = SearchActor(NETWORK, SMALL, 0, 0), LessonStore(SMALL, 0)
     for _ in range(16):
         store.add(actor.act())
     return {kind: buffer.storage.take(np.arange(min(buffer.size, 400))) for kind, buffer in store.buffers.items()}
@@ -62,7 +62,7 @@ def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
 
 def test_what_own_play_wins_is_not_searched():
     torch.manual_seed(0)
-    actor = SearchActor(NETWORK, SMALL, 0)
+    actor = SearchActor(NETWORK, SMALL, 0, 0)
     statistics = [actor.act().statistics for _ in range(12)]
     played, searched = (
         np.concatenate([found[f"{kind}/{d}"] for found in statistics for d in DIFFICULTIES])
@@ -86,7 +86,7 @@ def test_learning_waits_until_searches_have_taught_enough(lessons):
 def test_of_the_lessons_those_are_kept_in_which_the_planner_errs():
     erred = {}
     for easy in (0.0, 1.0):
-        actor = SearchActor(NETWORK, replace(SMALL, trees=64, easy=easy), 0)
+        actor = SearchActor(NETWORK, replace(SMALL, trees=64, easy=easy), 0, 0)
         actor.planner = load(compiled=False)
         lessons = [actor.act().arrays for _ in range(5)]
         samples = concatenate(
@@ -174,7 +174,22 @@ def test_levels_that_were_not_solved_come_again_and_the_mix_follows_what_is_solv
         TrainingLevels(-1)
 
 
-def run(path):
+def test_another_seed_plays_other_levels_by_another_chance_and_all_are_for_training():
+    seen, chances = [], []
+    for seed in (0, 1):
+        for stream in (0, 1):
+            actor = SearchActor(NETWORK, SMALL, seed, stream)
+            actor.act()
+            seen += [level for _, level, _ in actor.state().part("own").values["tickets"]]
+            chances.append(float(actor._rng.random()))
+    assert len(set(seen)) == 4 * SMALL.trees and all(x in TRAIN_SEEDS for x in seen)
+    assert len(set(chances)) == 4
+    for seed, stream in ((-1, 0), (0, 1000), (10**7, 0)):
+        with pytest.raises(ValueError, match="stream"):
+            SearchActor(NETWORK, SMALL, seed, stream)
+
+
+def run(path, seed=0):
     config = ExpertIterationConfig(
         channels=8,
         blocks=1,
@@ -182,6 +197,7 @@ def run(path):
         first_evaluations=1024,
         cpu_seconds=1e9,
         updates=8,
+        seed=seed,
     )
     trainer = expert_iteration(config, path, Cadence(publish_updates=2, save_seconds=math.inf))
     trainer.learner.evaluate = dict
@@ -190,6 +206,16 @@ def run(path):
 
 def test_a_run_resumes_to_the_bit(tmp_path):
     check_resuming(run, tmp_path, stop_at=4, updates=8)
+
+
+def test_a_run_plays_the_levels_of_its_seed(tmp_path):
+    levels = []
+    for seed in (0, 5):
+        trainer = run(tmp_path / str(seed), seed)
+        actor = trainer.source.pool.factory(0)
+        actor.act()
+        levels.append({level for _, level, _ in actor.state().part("own").values["tickets"]})
+    assert not levels[0] & levels[1]
 
 
 def test_a_batch_with_nan_teaches_nothing(tmp_path):

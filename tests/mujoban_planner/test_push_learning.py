@@ -15,7 +15,7 @@ from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
 from mujoban_rl.actors import Experience
 from mujoban_rl.engine import Cadence
 from mujoban_rl.testing import check_refusal, check_resuming
-from mujoban_sokoban.generator import generate_batch
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 
 PLAY = PlayConfig(environments=16, steps=4)
 SIZE = {"channels": 8, "blocks": 1, "cpu_seconds": 1e9, "updates": 6.0}
@@ -26,15 +26,15 @@ def one_thread():
     torch.set_num_threads(1)
 
 
-def ppo(path):
-    config = PushPPOConfig(play=PLAY, minibatch=32, **SIZE)
+def ppo(path, seed=0):
+    config = PushPPOConfig(play=PLAY, minibatch=32, seed=seed, **SIZE)
     trainer = push_ppo(config, path, Cadence(publish_updates=1, save_seconds=math.inf))
     trainer.learner.evaluate = dict
     return trainer
 
 
-def mpo(path):
-    config = PushMPOConfig(play=PLAY, batch_size=32, first_steps=256, replay_steps=40, n_step=3, **SIZE)
+def mpo(path, seed=0):
+    config = PushMPOConfig(play=PLAY, batch_size=32, first_steps=256, replay_steps=40, n_step=3, seed=seed, **SIZE)
     trainer = push_mpo(config, path, Cadence(publish_updates=2, save_seconds=math.inf))
     trainer.learner.evaluate = dict
     return trainer
@@ -43,6 +43,15 @@ def mpo(path):
 @pytest.mark.parametrize("make", [ppo, mpo])
 def test_runs_resume_to_the_bit(make, tmp_path):
     check_resuming(make, tmp_path, stop_at=3, updates=6)
+
+
+@pytest.mark.parametrize("make", [ppo, mpo])
+def test_another_seed_plays_other_levels_by_another_chance(make, tmp_path):
+    states = [make(tmp_path / str(seed), seed).source.pool.factory(0).state() for seed in (0, 5)]
+    levels = [{level for _, level, _ in state.part("own").values["tickets"]} for state in states]
+    assert not levels[0] & levels[1] and all(level in TRAIN_SEEDS for level in levels[0] | levels[1])
+    one, other = (state.part("own").tensors["generator"] for state in states)
+    assert not torch.equal(one, other)
 
 
 @pytest.mark.parametrize("make", [ppo, mpo])

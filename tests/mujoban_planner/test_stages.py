@@ -21,7 +21,7 @@ from mujoban_rl.engine import Cadence, Trainer
 from mujoban_rl.run_directory import RunError
 
 PLAY = PlayConfig(environments=8, steps=4)
-CONFIG = StagesConfig(("ppo=1", "mpo-pushes=3"), cpu_seconds=8e9, channels=8, blocks=1)
+CONFIG = StagesConfig(("ppo=1", "mpo-pushes=3"), cpu_seconds=8e9, channels=8, blocks=1, seed=3)
 OFTEN = Cadence(publish_updates=1, save_seconds=math.inf)
 
 
@@ -51,6 +51,7 @@ def test_each_stage_begins_with_the_planner_of_the_one_before(tmp_path: Path, st
     first, second = tmp_path / "1_ppo" / "planner.safetensors", tmp_path / "2_mpo-pushes" / "planner.safetensors"
     assert [s.init for s in started] == [None, str(first)]
     assert [s.cpu_seconds for s in started] == [2e9, 6e9]
+    assert [s.seed for s in started] == [6, 7], "levels of its own, which no other seed's run has"
     record = json.loads((tmp_path / "planner.json").read_text())
     assert digest(tmp_path / "planner.safetensors") == digest(second)
     assert record["init"] == digest(first) and record["method"] == "ppo over pushes then mpo over pushes"
