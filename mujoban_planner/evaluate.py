@@ -24,6 +24,7 @@ from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import take_levels
 from mujoban_planner.lookahead import LookAheadPlanner
+from mujoban_planner.option_checks import check_counts
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
 from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_batch, seed_range
@@ -67,6 +68,11 @@ class Options:
     """Threads of the network on a CPU."""
     json: Path | None = None
     """Where the figures are written."""
+
+    def __post_init__(self) -> None:
+        """Reject thinking less than once."""
+        if self.thinking is not None:
+            check_counts(self, "thinking")
 
     def level_batch(self) -> LevelBatch:
         """Return the levels.

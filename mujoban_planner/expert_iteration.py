@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from mujoban_planner.imitation import ImitationLearner, LearnerConfig
+from mujoban_planner.option_checks import check_counts, check_positive, check_shares
 from mujoban_planner.samples import Batch
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
 from mujoban_rl.actors import ActorOptions, ActorSource
@@ -41,6 +42,13 @@ class ExpertIterationConfig(LearnerConfig):
     minutes."""
     updates: float = 1e9
     """Updates after which it is complete."""
+
+    def __post_init__(self) -> None:
+        """Reject numbers with which nothing is learned, and what is no share."""
+        super().__post_init__()
+        check_counts(self, "channels", "blocks", "first_evaluations")
+        check_positive(self, "evaluations", "learning_rate")
+        check_shares(self, "warm_up")
 
 
 def expert_iteration(

@@ -84,8 +84,9 @@ class LookAheadPlanner(Planner):
     def initial_memory(self, batch: int) -> Memory:
         """Return the memory at the start of `batch` episodes.
 
-        It holds the plan, its cursor, the state that it continues from, the targets that it leads to, how often the robot
-        has waited since its last push, the search (None or a `LoneSearch`, which goes on), and the planner's memory.
+        It holds the plan, its cursor, the state that it continues from, the targets that it leads to, how often the
+        robot has waited since its last push, the search (None or a `LoneSearch`, which goes on), and the planner's
+        memory.
         """
         plan = np.zeros((batch, MOVE_LIMIT + 1), np.int64)
         expected = np.zeros(batch, np.int64), np.full(batch, _NO_KEY, np.int64), np.zeros(batch, np.uint64)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_planner.boards import BitBoards
+from mujoban_planner.option_checks import check_counts, check_positive
 from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.push_policy import PushPolicy
 from mujoban_planner.training_levels import Ticket, TrainingLevels, stream_number
@@ -37,6 +38,11 @@ class PlayConfig:
     """Pushes in each that are delivered at once."""
     reward_scale: float = 0.1
     """Factor on rewards, so that returns are about one."""
+
+    def __post_init__(self) -> None:
+        """Reject numbers with which nothing is played or learned."""
+        check_counts(self, "environments", "steps")
+        check_positive(self, "reward_scale")
 
 
 class PushActor(Actor):

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_planner.boards import BitBoards, signed
+from mujoban_planner.option_checks import check_counts, check_positive, check_shares
 from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
 from mujoban_planner.push_policy import PushPolicy, images
 from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
@@ -69,6 +70,13 @@ class PushMPOConfig(PushRunConfig):
     dual_learning_rate: float = 1e-2
     warm_up: float = 0.01
     """Share of the budget in which the learning rate rises."""
+
+    def __post_init__(self) -> None:
+        """Reject numbers with which nothing is learned, and what is no share."""
+        super().__post_init__()
+        check_counts(self, "batch_size", "replay_steps", "first_steps", "n_step")
+        check_positive(self, "reuse", "q_weight", "learning_rate", "dual_learning_rate")
+        check_shares(self, "discount", "average", "warm_up")
 
 
 class PushMPOLearner(Learner[Window]):

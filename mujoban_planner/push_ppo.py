@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.distributions import Categorical
 
 from mujoban_planner.boards import BitBoards
+from mujoban_planner.option_checks import check_counts, check_positive, check_shares
 from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
 from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
 from mujoban_planner.validation import success_rates
@@ -48,6 +49,14 @@ class PushPPOConfig(PushRunConfig):
     learning_rate: float = 1e-3
     warm_up: float = 0.01
     """Share of the budget in which the learning rate rises."""
+
+    def __post_init__(self) -> None:
+        """Reject numbers with which nothing is learned, and what is no share."""
+        super().__post_init__()
+        check_counts(self, "epochs", "minibatch")
+        check_counts(self, "entropy", least=0)
+        check_positive(self, "learning_rate")
+        check_shares(self, "discount", "decay", "warm_up")
 
 
 class PushPPOLearner(Learner[Arrays]):

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from mujoban_planner.growth import start_from
+from mujoban_planner.option_checks import check_counts
 from mujoban_planner.push_policy import PushPolicy
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Budget
@@ -31,6 +32,11 @@ class PushRunConfig(NetworkConfig):
     updates: float = 1e9
     """Updates after which it is complete."""
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Reject networks of nothing and seeds that there are not."""
+        check_counts(self, "channels", "blocks")
+        check_counts(self, "seed", least=0)
 
     @property
     def budget(self) -> Budget:

@@ -26,6 +26,7 @@ from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import BitBoards, level_batch
 from mujoban_planner.forest import Forest, Verdicts
 from mujoban_planner.lessons import errs
+from mujoban_planner.option_checks import check_counts, check_shares
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch, unlabelled
 from mujoban_planner.search import grow
 from mujoban_planner.symmetry import SYMMETRIES
@@ -79,6 +80,12 @@ class SearchConfig:
     """Share of a batch whose abstract states are blurred, as estimates are."""
     hidden: float = 0.0
     """Share of a batch that shows only what the robot may have seen so far."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no number of its kind, and no share."""
+        check_counts(self, "trees", "expansions", "steps", "buffer", "batch_size")
+        check_counts(self, "questions", "retries", "lead", "verdicts", least=0)
+        check_shares(self, "retried", "walks", "led", "judged", "easy", "noise", "hidden")
 
 
 @dataclass

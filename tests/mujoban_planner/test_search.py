@@ -111,7 +111,7 @@ def test_a_robot_that_looks_ahead_waits_before_a_push_until_the_search_has_ended
     assert 0 in decisions[:pushed] or pushed >= 60
 
 
-def test_a_robot_waits_for_one_search_at_most_where_estimates_flicker_and_forgets_nothing_meanwhile(planner, monkeypatch):
+def test_a_robot_waits_for_one_search_at_most_where_estimates_flicker_and_forgets_nothing(planner, monkeypatch):
     lines = ("########\n#@$  . #\n#      #\n#  $ . #\n########", "########\n#@$  . #\n#  $   #\n#    . #\n########")
     states = [abstract_states(stack_levels([Level.from_text(text)])) for text in lines]
     player = LookAheadPlanner(planner, 300, per_tick=1)
@@ -202,7 +202,13 @@ def test_evaluate_reports_rate_interval_and_optimality(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     "arguments",
-    [("--difficulty", 6), ("--levels", "missing.txt"), ("--weights", "missing.safetensors"), ("--seed", 10**7)],
+    [
+        ("--difficulty", 6),
+        ("--levels", "missing.txt"),
+        ("--weights", "missing.safetensors"),
+        ("--seed", 10**7),
+        ("--thinking", -3),
+    ],
 )
 def test_bad_input_ends_evaluate_with_one_line_and_status_2(arguments, capsys):
     assert _run("--episodes", 3, *arguments) == 2

@@ -233,6 +233,29 @@ def test_bad_training_input_ends_with_one_line_and_status_2(tmp_path, capsys):
     assert "another configuration" in error and len(error.splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("method", "option", "value"),
+    [
+        ("mpo-pushes", "--reuse", "0"),
+        ("mpo-pushes", "--n-step", "0"),
+        ("mpo-pushes", "--environments", "0"),
+        ("ppo", "--minibatch", "0"),
+        ("ppo", "--discount", "1.5"),
+        ("ppo", "--channels", "0"),
+        ("expert-iteration", "--trees", "0"),
+        ("expert-iteration", "--questions", "-1"),
+        ("expert-iteration", "--easy", "nan"),
+        ("expert-iteration", "--evaluations", "0"),
+    ],
+)
+def test_an_option_out_of_its_range_is_named_before_anything_begins(tmp_path, capsys, method, option, value):
+    arguments = [method, "--run", str(tmp_path / "run"), option, value]
+    assert exit_status("train", partial(train.main, arguments)) == 2
+    error = capsys.readouterr().err.strip()
+    assert option in error and "expected" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_larger_network_begins_with_what_a_smaller_one_says(tmp_path):
     torch.manual_seed(0)
     small, path = ResidualPlanner(16, 1, judge=True), tmp_path / "small.safetensors"
