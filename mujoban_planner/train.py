@@ -1,4 +1,7 @@
-"""Train the planner: `python -m mujoban_planner.train imitation`, `... expert-iteration` or `... mpo`."""
+"""Train the planner or what says where to look: `python -m mujoban_planner.train METHOD`.
+
+METHOD is imitation, expert-iteration, ppo, mpo, mpo-pushes, stages or explorer.
+"""
 
 from __future__ import annotations
 
