@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import BitBoards, signed
 from mujoban_planner.forest_kernels import hopeless
-from mujoban_planner.teacher import STEP_REWARD
+from mujoban_planner.teacher import STEP_REWARD, reachable_pushes
 from mujoban_rl.engine import State
-from mujoban_sokoban.bitboard import NONE, ONE, SQUARE_STEP, SQUARES, bit, flood, lowest, pushable, pushed
+from mujoban_sokoban.bitboard import NONE, SQUARE_STEP, SQUARES, bit, flood, pushable, pushed
 from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD
 from mujoban_sokoban.solver_labels import walk_distances
 from mujoban_sokoban.solver_search import dead_squares, push_distances
@@ -111,23 +111,8 @@ class PushEnvironment:
 
 def possible_masks(boards: BitBoards) -> NDArray[np.bool_]:
     """Return which pushes are possible in M states after any walk, [M, 256]."""
-    mask = np.zeros((len(boards.agent), PUSHES), np.bool_)
-    _fill_possible(boards.wall, boards.box, boards.agent, mask)
-    return mask
-
-
-@njit(cache=True, nogil=True)
-def _fill_possible(
-    wall: NDArray[np.uint64], box: NDArray[np.uint64], agent: NDArray[np.uint8], mask: NDArray[np.bool_]
-) -> None:
-    for i in range(len(agent)):
-        free = ~(wall[i] | box[i])
-        reached = flood(bit(agent[i]), free)
-        for direction in range(4):
-            ready = pushable(reached, free, box[i], direction)
-            while ready != NONE:
-                mask[i, SQUARES * direction + lowest(ready)] = True
-                ready &= ready - ONE
+    pushes = reachable_pushes(boards).astype("<u8").view(np.uint8)
+    return np.unpackbits(pushes, axis=1, bitorder="little").view(np.bool_)
 
 
 @njit(cache=True, nogil=True)
