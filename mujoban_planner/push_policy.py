@@ -38,8 +38,9 @@ class PushOutput(NamedTuple):
 class PushPolicy(nn.Module):
     """The push head of a planner network as policy, and a critic that reads the same features.
 
-    The other heads get no gradient. Those that would have a say in the planner's decision are masked, so that it goes
-    by the push head alone.
+    The other heads get no gradient. Of a network that nothing was taught, those that would have a say in the planner's
+    decision are masked, so that it goes by the push head alone; of another they keep their say, as they were taught
+    before, and read a trunk that goes on changing under them.
     """
 
     def __init__(self, planner: LearnedPlanner, *, untaught: bool) -> None:
