@@ -132,8 +132,7 @@ def vtrace_parts(
     unroll, build = config.vtrace, partial(kind, config.task.body)
     plays = task or partial(MujobanTask, config.task)
     factory = partial(make_actor, plays, build, unroll.length, 1, (), config.seed)
-    steps = unroll.unroll * config.task.robots * actors.num_actors
-    source = ActorSource(actors.pool(factory), Rollouts(axis=1), steps_per_update=steps)
+    source = ActorSource(actors.pool(factory), Rollouts(axis=1, count=actors.num_actors))
     return VTraceLearner(build(), unroll), source
 
 

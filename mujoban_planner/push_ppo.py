@@ -147,8 +147,7 @@ def push_ppo(
     """Return the trainer of a run of PPO over pushes, resumed if there is one in the directory."""
     options = actors or ActorOptions()
     pool = options.pool(partial(PushActor, config.network, config.play, config.seed))
-    steps = config.play.steps * config.play.environments * options.num_actors
-    source = ActorSource(pool, Rollouts(axis=-1), steps_per_update=steps)
+    source = ActorSource(pool, Rollouts(axis=-1, count=options.num_actors))
     return Trainer(
         RunDirectory(directory, config),
         PushPPOLearner(config),

@@ -46,22 +46,23 @@ class ActorSource(Source[BatchT], Generic[BatchT]):
     """
 
     def __init__(
-        self, pool: ActorPool, store: ExperienceStore[BatchT], *, steps_per_update: float, first_steps: int = 0
+        self, pool: ActorPool, store: ExperienceStore[BatchT], *, steps_per_update: float = 0.0, first_steps: int = 0
     ) -> None:
         """Draw batches from a store that a pool fills.
 
         Args:
             pool: The actors.
             store: The replay.
-            steps_per_update: Environment steps that are collected for each update.
+            steps_per_update: Environment steps that are collected for each update; 0: as many as the store needs for a
+                batch.
             first_steps: Environment steps that are collected before the first update, in addition.
 
         Raises:
             ValueError: If a number is out of its range.
         """
-        if not steps_per_update > 0.0 or first_steps < 0:
+        if not steps_per_update >= 0.0 or first_steps < 0:
             raise ValueError(
-                f"{steps_per_update} steps per update, {first_steps} before: expected more than 0, and at least 0"
+                f"{steps_per_update} steps per update, {first_steps} before: expected at least 0 of both"
             )
         self.pool, self.store = pool, store
         self._ratio, self._first = steps_per_update, first_steps
@@ -159,17 +160,19 @@ class ReplayStore(ABC, Generic[BatchT]):
 class Rollouts:
     """Hands on what actors delivered, once: the store of methods that learn from the newest experience alone."""
 
-    def __init__(self, axis: int) -> None:
-        """Put the arrays of actors side by side along an axis, that of their environments."""
-        self._axis = axis
+    def __init__(self, axis: int, count: int) -> None:
+        """Put `count` rollouts, one of each actor, side by side along an axis, that of their environments."""
+        self._axis, self._count = axis, count
         self._parts: list[Arrays] = []
 
     def add(self, experience: Experience) -> None:
         """Take the rollout of an actor."""
         self._parts.append(experience.arrays)
 
-    def sample(self) -> Arrays:
-        """Return the rollouts of all actors since the last call."""
+    def sample(self) -> Arrays | None:
+        """Return the rollouts since the last call, None while there are fewer than actors."""
+        if len(self._parts) < self._count:
+            return None
         parts, self._parts = self._parts, []
         return {name: np.concatenate([part[name] for part in parts], axis=self._axis) for name in parts[0]}
 

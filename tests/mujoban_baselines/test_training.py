@@ -12,7 +12,7 @@ import torch
 from mujoban_baselines.actor import make_actor
 from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAgent
 from mujoban_baselines.critics import Critic
-from mujoban_baselines.impala import VTraceTrainingConfig
+from mujoban_baselines.impala import VTraceLearner, VTraceTrainingConfig
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig
 from mujoban_baselines.networks import AgentOutput, BodySense, Recurrent, RecurrentAgent, dense
 from mujoban_baselines.squares import SquaresTask
@@ -35,9 +35,10 @@ def mpo(folder, critic="asymmetric"):
     return make_trainer(config, parts, folder, CADENCE, "mpo")
 
 
-def structured(folder):
+def structured(folder, actors=1):
     config = VTraceRunConfig(task=TaskConfig(robots=2), vtrace=VTraceTrainingConfig(unroll=3))
-    parts = vtrace_parts(config, StructuredAgent, ActorOptions(), partial(SquaresTask, batch=2))
+    options = ActorOptions(num_actors=actors)
+    parts = vtrace_parts(config, StructuredAgent, options, partial(SquaresTask, batch=2))
     return make_trainer(config, parts, folder, CADENCE, "structured")
 
 
@@ -49,6 +50,19 @@ def test_a_run_goes_on_where_it_stopped_and_a_batch_with_nan_changes_nothing(mak
         return {name: values * math.nan if name == "reward" else values for name, values in batch.items()}
 
     check_refusal(make(tmp_path / "nan"), poison)
+
+
+def test_v_trace_goes_on_with_more_or_fewer_actors_from_one_unroll_of_each(tmp_path, monkeypatch):
+    shapes, update = [], VTraceLearner.update
+
+    def seen(learner, batch, *rest):
+        shapes.append(batch["reward"].shape)
+        return update(learner, batch, *rest)
+
+    monkeypatch.setattr(VTraceLearner, "update", seen)
+    for bit, actors in enumerate((2, 1, 3)):
+        structured(tmp_path, actors).run(limit_updates=4 * (bit + 1))
+    assert shapes == [(4, 4)] * 4 + [(4, 2)] * 4 + [(4, 6)] * 4
 
 
 class Blank(Critic):
