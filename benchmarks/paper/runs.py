@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from mujoban_core.bodies import BALL
 from mujoban_core.files import digest
-from mujoban_core.plugins import PRIVILEGED, ROLES, SCOUT, shipped_weights
+from mujoban_core.plugins import AGENT, PRIVILEGED, ROLES, SCOUT, shipped_weights
 from mujoban_core.program import read_options, run_command
 from mujoban_sim.presets import DEFAULT_WORLD
 
@@ -53,7 +53,9 @@ class Run:
     body: str = BALL.name
     world: str = DEFAULT_WORLD
     controller: Path | None = None
-    """Weights of the controller, where those of another body play."""
+    """Weights of the controller, where others than those that ship play."""
+    planner: Path | None = None
+    """The same of the planner."""
     further: tuple[str, ...] = ()
     """Further options of `bringup/evaluate.py`."""
 
@@ -69,17 +71,22 @@ class Run:
 
     def missing_weights(self) -> Path | None:
         """Return where weights that are trained apart from the stack's should be and are not."""
-        apart = [self.agent, shipped_weights(SCOUT) if _LEARNED_SCOUT[0] in self.further else None]
-        return next((path for path in apart if path is not None and not path.is_file()), None)
+        scout = [shipped_weights(SCOUT)] if _LEARNED_SCOUT[0] in self.further else []
+        return next((path for path in (*self.own.values(), *scout) if not path.is_file()), None)
+
+    @property
+    def own(self) -> dict[str, Path]:
+        """Weights other than those that ship, by the role that they play."""
+        given = {AGENT: self.agent, "controller": self.controller, "planner": self.planner}
+        return {role: path for role, path in given.items() if path is not None}
 
     def options(self) -> list[str]:
         """Return the options of `bringup/evaluate.py` but for levels, seed and report."""
         oracle = ["--oracle", ",".join(self.oracle)] if self.oracle else []
-        agent = [] if self.agent is None else ["--agent", str(self.agent)]
         body = [] if self.body == BALL.name else ["--body", self.body]
         world = [] if self.world == DEFAULT_WORLD else ["--world", self.world]
-        controller = [] if self.controller is None else ["--controller", str(self.controller)]
-        return ["--difficulty", str(self.difficulty), *oracle, *agent, *body, *world, *controller, *self.further]
+        own = [text for role, path in self.own.items() for text in (f"--{role}", str(path))]
+        return ["--difficulty", str(self.difficulty), *oracle, *body, *world, *own, *self.further]
 
 
 SENSE: Final = ("estimator", "termination")
@@ -145,11 +152,14 @@ def read_source(file: Path, keys: tuple[str, ...], rerun: str) -> dict[str, Any]
 
 
 def is_stale(report: dict[str, Any], run: Run | None = None) -> bool:
-    """Tell whether a module of an evaluation, of a run, had other weights than those that ship for it now."""
-    own = {} if run is None or run.controller is None else {"controller": run.controller}
-    told = {role: name.removesuffix(PRIVILEGED) for role, name in report["weights"].items() if role in ROLES}
+    """Tell whether what played in an evaluation, of a run, had other weights than are to play there now.
+
+    What is to play and is not on this machine counts as what played: the weights of agents do not ship.
+    """
+    current = {role: shipped_weights(role) for role in (*ROLES, SCOUT)} | ({} if run is None else run.own)
+    told = {role: name.removesuffix(PRIVILEGED) for role, name in report["weights"].items() if role in current}
     return any(
-        len(name) == DIGEST_LENGTH and name != digest(own.get(role) or shipped_weights(role))
+        len(name) == DIGEST_LENGTH and current[role].is_file() and name != digest(current[role])
         for role, name in told.items()
     )
 

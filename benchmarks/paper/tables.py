@@ -73,15 +73,15 @@ def baselines(modular: Run) -> str:
 
 def _rates(runs: Sequence[Run]) -> list[str]:
     """Return the number of levels, and success with its interval at each difficulty."""
-    reports = [load(run) for run in runs]
-    counts = {len(report["episodes"]) for report in reports if report}
+    reports = [(run, load(run)) for run in runs]
+    counts = {len(report["episodes"]) for _, report in reports if report}
     cells = []
-    for report in reports:
+    for run, report in reports:
         if report is None:
             cells.append(MISSING)
             continue
         low, high = report["success_interval"]
-        stale = STALE if is_stale(report) else ""
+        stale = STALE if is_stale(report, run) else ""
         cells.append(f"{100 * report['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f}){stale}")
     return ["/".join(map(str, sorted(counts))) or "0", *cells]
 

@@ -172,6 +172,23 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
         results.rebuild(folder)
 
 
+def test_an_agent_that_was_trained_anew_is_measured_anew(folder, monkeypatch, capsys):
+    weights = folder / "agent.safetensors"
+    run = runs.Run("mine", "mine", 1, agent=weights)
+    monkeypatch.setattr(runs, "ALL", (run,))
+    weights.write_bytes(b"first")
+    write(run, 3, 4, {"agent": f"{digest(weights)} (privileged)"})
+    part = parts.Part(run, 0, 4)
+    part.file.parent.mkdir(parents=True)
+    write_report(runs.load(run), part.file)
+    assert runs.is_current(run, 4) and part.load() is not None and tables.STALE not in tables.configurations([run])
+    weights.write_bytes(b"second")
+    assert not runs.is_current(run, 4) and part.load() is None and tables.STALE in tables.configurations([run])
+    weights.unlink()
+    assert runs.is_current(run, 4), "where the weights are not, nothing is known against them"
+    assert runs.main(["--only", "mine"]) == 0 and "no weights at" in capsys.readouterr().out
+
+
 @pytest.fixture
 def drawn(monkeypatch):
     monkeypatch.setattr(figures.plt, "close", lambda figure: None)
