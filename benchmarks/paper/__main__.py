@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.paper import bodies, curves, figures, film, tables
+from benchmarks.paper.baselines import JOINT
 from benchmarks.paper.runs import (
     ALL,
     CONFIGURATIONS,
@@ -90,6 +91,10 @@ def rebuild(folder: Path) -> Path:
         tables.configurations(CONFIGURATIONS[:1]),
         TABLE_1,
         tables.baselines(CONFIGURATIONS[0]),
+        "Every row is given the same environment steps and CPU time, by\n",
+        tables.commands(),
+        "Why episodes of difficulty 5 fail, before fine-tuning as a whole and after:\n",
+        tables.failures((CONFIGURATIONS[0], JOINT.run(CONFIGURATIONS[0].difficulty))),
         *_baseline_curves(folder),
         "## Table 2: module evaluation\n",
         TABLE_2,

@@ -3,7 +3,7 @@
     python -m benchmarks.paper.baselines mpo_easy=runs/baselines/mpo_easy ...     # note what a run cost, and its curve
     python -m benchmarks.paper.runs --only mpo_easy_1 mpo_easy_5                  # evaluate its weights
 
-The first writes `baseline_<name>.jsonl`, an object a line with `step`, `cpu_seconds`, and `solved` and `return` of the
+The first writes `baseline_<name>.jsonl`, an object a line with `step`, `cpu_seconds`, `seconds` of wall-clock, and `solved` and `return` of the
 episodes that were played in training, by difficulty.
 """
 
@@ -23,6 +23,7 @@ from benchmarks.paper.curves import read_metrics
 from benchmarks.paper.runs import ROOT, ResultError, Run
 from mujoban_core.files import write_atomically
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.plugins import AGENT
 from mujoban_core.program import read_options, run_command
 
 PROG: Final = "benchmarks.paper.baselines"
@@ -41,17 +42,21 @@ class Baseline:
     levels: str
     """What it is trained on."""
     method: str
-    """Arguments of `python -m mujoban_baselines.train`, but for the run directory."""
+    """Arguments of `python -m mujoban_baselines.train`, but for budget and run directory."""
+    paper: str
+    """How long the paper trained it, with how many actors."""
+    modules: bool = False
+    """Whether it leaves controller and planner, which play with the modules that ship, in the place of an agent."""
 
     @property
-    def weights(self) -> Path:
-        """Where its run is expected to leave its weights."""
-        return ROOT / "runs" / "baselines" / self.name / "agent.safetensors"
+    def folder(self) -> Path:
+        """Where its run is expected."""
+        return ROOT / "runs" / "baselines" / self.name
 
     @property
     def command(self) -> str:
         """The command that trains it."""
-        return f"python -m mujoban_baselines.train {self.method} --run runs/baselines/{self.name}"
+        return f"python -m mujoban_baselines.train {self.method} {BUDGET} --run runs/baselines/{self.name}"
 
     @property
     def curve(self) -> Path:
@@ -60,24 +65,36 @@ class Baseline:
 
     def run(self, difficulty: int) -> Run:
         """Return its evaluation at a difficulty."""
-        return Run(f"{self.name}_{difficulty}", self.title, difficulty, agent=self.weights)
+        roles = ("controller", "planner") if self.modules else (AGENT,)
+        weights = {role: self.folder / f"{role}.safetensors" for role in roles}
+        return Run(f"{self.name}_{difficulty}", self.title, difficulty, **weights)
 
 
+HOURS: Final = 8.0
+"""Of wall-clock on two cores: what `make weights` takes for the whole stack, and every row may take."""
+BUDGET: Final = f"--steps 20000000 --cpu-seconds {2 * 3600 * HOURS:.0f}"
+"""What completes a run, whichever comes first; the same for all rows."""
+RECORDING: Final = "python bringup/record.py --out bags/stack --undisturbed --episodes 512"
+"""Records what is cloned; without `--undisturbed` the disturbances would be cloned too."""
 _ROBOT, _ABOVE = "o_cam, o_pr, o_pos", "o_top, o_pr"
+_PARTIAL, _FULL, _NOT = "5 days, 256 actors", "21 days, 1,000 actors", "not there"
 BASELINES: Final = (
-    Baseline("mpo_hard", "MPO, asym.", _ROBOT, "hard", "monolithic-mpo"),
-    Baseline("mpo_hard_sym", "MPO, sym.", _ROBOT, "hard", "monolithic-mpo --critic symmetric"),
-    Baseline("mpo_curriculum", "MPO, asym.", _ROBOT, "curriculum", "monolithic-mpo --levels curriculum"),
-    Baseline("mpo_easy", "MPO, asym.", _ROBOT, "easy", "monolithic-mpo --levels easy"),
+    Baseline("mpo_hard", "MPO, asym.", _ROBOT, "hard", "monolithic-mpo", _PARTIAL),
+    Baseline("mpo_hard_sym", "MPO, sym.", _ROBOT, "hard", "monolithic-mpo --critic symmetric", _PARTIAL),
+    Baseline("mpo_curriculum", "MPO, asym.", _ROBOT, "curriculum", "monolithic-mpo --levels curriculum", _PARTIAL),
+    Baseline("mpo_easy", "MPO, asym.", _ROBOT, "easy", "monolithic-mpo --levels easy", _PARTIAL),
     Baseline(
-        "mpo_cloned", "MPO, asym., after cloning the stack", _ROBOT, "curriculum",
+        "mpo_cloned", "MPO, asym., after cloning the stack", _ROBOT, "curriculum; the clone's bags",
         "monolithic-mpo --levels curriculum --mpo.critic-first 1000 --start runs/baselines/clone/agent.safetensors",
+        _NOT,
     ),
-    Baseline("clone", "cloning of the stack alone", _ROBOT, "bags", "clone --bags bags/stack"),
-    Baseline("vtrace", "V-trace", _ABOVE, "curriculum", "monolithic-vtrace"),
-    Baseline("structured", "structured V-trace", f"{_ABOVE}, s_abst", "curriculum", "structured-vtrace"),
+    Baseline("clone", "cloning of the stack alone", _ROBOT, "bags", "clone --bags bags/stack", _NOT),
+    Baseline("vtrace", "V-trace", _ABOVE, "curriculum", "monolithic-vtrace", _FULL),
+    Baseline("structured", "structured V-trace", f"{_ABOVE}, s_abst", "curriculum", "structured-vtrace", _FULL),
+    Baseline("joint", "modular, fine-tuned as a whole", _ROBOT, "hard, from the modular row", "joint", _NOT, True),
 )  # fmt: skip
-"""The agents of appendix D, and a monolithic one that may copy."""
+"""The agents of appendix D, a monolithic one that may copy, and the stack fine-tuned for the task's reward."""
+JOINT: Final = BASELINES[-1]
 RUNS: Final = tuple(baseline.run(d) for baseline in BASELINES for d in DIFFICULTIES)
 """Their evaluations."""
 
@@ -101,7 +118,8 @@ def read_curve(run: Path) -> list[dict[str, Any]]:
         raise ResultError(f"{run}: its metrics are empty")
     points = []
     for part in np.array_split(np.array(lines, object), min(len(lines), _MOST)):
-        point: dict[str, Any] = {"step": part[-1]["step"], "cpu_seconds": round(part[-1].get("cpu_seconds") or 0.0)}
+        point: dict[str, Any] = {"step": part[-1]["step"]}
+        point |= {kind: round(part[-1].get(kind) or 0.0) for kind in ("cpu_seconds", "seconds")}
         for kind in _KINDS:
             seen = {d: [line[f"{kind}/{d}"] for line in part if f"{kind}/{d}" in line] for d in DIFFICULTIES}
             known = {str(d): [value for value in values if value is not None] for d, values in seen.items()}
@@ -120,7 +138,7 @@ def points_of(baseline: Baseline) -> list[dict[str, Any]]:
         return []
     try:
         points = [json.loads(line) for line in baseline.curve.read_text().splitlines()]
-        if any({"step", "cpu_seconds", *_KINDS} - point.keys() for point in points):
+        if any({"step", "cpu_seconds", "seconds", *_KINDS} - point.keys() for point in points):
             raise ValueError("a point lacks a value")
     except ValueError as error:
         again = f"python -m {PROG} {baseline.name}=runs/baselines/{baseline.name}"

@@ -7,13 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.paper.baselines import BASELINES, points_of
+from benchmarks.paper.baselines import BASELINES, RECORDING, points_of
 from benchmarks.paper.runs import DIFFICULTY, Run, is_stale, load
 from mujoban_core.grid import DIFFICULTIES
 
 STALE = " †"
 """Marks a result of other weights than those that ship now."""
 MISSING = "-"
+MODULAR_LEVELS = (
+    "all difficulties; a solver's demonstrations, a teacher, rules that look around ([model cards](../models/))"
+)
+"""What the modules that ship learned from, where the other rows have reward alone."""
+MODULAR_PAPER = "7 days, 200 to 1,000 actors a module"
 
 
 def configurations(runs: Sequence[Run]) -> str:
@@ -60,15 +65,30 @@ def test_uses(runs: Sequence[Run]) -> str:
 
 
 def baselines(modular: Run) -> str:
-    """Return Table 1: the modular stack and the agents that it is compared with, with what each was trained on."""
-    header = ["agent", "sees", "trained on", "steps", "CPU hours", "n", *(f"difficulty {d}" for d in DIFFICULTIES)]
-    rows = [["modular", "o_cam, o_pr, o_pos", "hard", MISSING, MISSING, *_rates([*DIFFICULTY[:-1], modular])]]
+    """Return Table 1: the modular stack and what it is compared with, what each was trained on and how long."""
+    header = ["agent", "sees", "trained on", "steps", "CPU hours", "wall-clock", "paper", "n"]
+    header += [f"difficulty {d}" for d in DIFFICULTIES]
+    rows = [
+        ["modular", "o_cam, o_pr, o_pos", MODULAR_LEVELS, *[MISSING] * 3, MODULAR_PAPER]
+        + _rates([*DIFFICULTY[:-1], modular])
+    ]
     for row in BASELINES:
-        points = points_of(row)
-        steps = f"{points[-1]['step'] / 1e6:.2f} M" if points else MISSING
-        hours = f"{points[-1]['cpu_seconds'] / 3600:.1f}" if points else MISSING
-        rows.append([row.title, row.sees, row.levels, steps, hours, *_rates([row.run(d) for d in DIFFICULTIES])])
+        cost = _cost(points_of(row))
+        rows.append([row.title, row.sees, row.levels, *cost, row.paper, *_rates([row.run(d) for d in DIFFICULTIES])])
     return _table(header, rows)
+
+
+def commands() -> str:
+    """Return the commands that train the rows of Table 1, as a block of code."""
+    return "".join(f"    {line}\n" for line in (RECORDING, *(row.command for row in BASELINES)))
+
+
+def _cost(points: Sequence[dict[str, Any]]) -> list[str]:
+    """Return steps, CPU hours and hours of wall-clock of a run, given its curve."""
+    if not points:
+        return [MISSING] * 3
+    last = points[-1]
+    return [f"{last['step'] / 1e6:.2f} M", *(f"{last[kind] / 3600:.1f}" for kind in ("cpu_seconds", "seconds"))]
 
 
 def _rates(runs: Sequence[Run]) -> list[str]:

@@ -8,8 +8,10 @@ from benchmarks.paper import __main__ as results
 from benchmarks.paper import baselines, bodies, curves, figures, film, parts, runs, tables
 from bringup.command import Choice, Stack
 from bringup.results import EpisodeResult, report, write_report
+from mujoban_baselines.train import COMMANDS, PROG
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
+from mujoban_core.program import read_options
 from mujoban_planner import curves as planner_curves
 
 ORACLES = Stack({role: Choice(role, "oracle") for role in ROLES})
@@ -151,19 +153,20 @@ def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
 
 def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
     lines = [
-        {"step": 1000 * i, "cpu_seconds": 360.0 * i, "solved/1": i / 10, "return/1": float(i), "solved/5": None}
+        {"step": 1000 * i, "cpu_seconds": 360.0 * i, "seconds": 180.0 * i, "solved/1": i / 10, "return/1": float(i),
+         "solved/5": None}
         for i in range(1, 11)
-    ]
+    ]  # fmt: skip
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert baselines.main([f"mpo_easy={tmp_path / 'run'}"]) == 0
     row = next(row for row in baselines.BASELINES if row.name == "mpo_easy")
-    cost = {"step": 10_000, "cpu_seconds": 3600}
+    cost = {"step": 10_000, "cpu_seconds": 3600, "seconds": 1800}
     assert baselines.points_of(row)[-1] == {**cost, "solved": {"1": 1.0}, "return": {"1": 10.0}}
     write(row.run(1), 3, 4, {"agent": "a" * 64})
     page = results.rebuild(folder).read_text()
     rates = "75.0 % (30.1 to 95.4) | - | - | - | -"
-    assert f"| MPO, asym. | o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 4 | {rates} |" in page
+    assert f"| MPO, asym. | o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 0.5 | 5 days, 256 actors | 4 | {rates} |" in page
     assert (folder / "baselines.png").stat().st_size and "--agent" in row.run(1).options()
     with pytest.raises(ValueError, match="nobody=x: expected NAME=RUN with a name among mpo_hard"):
         baselines.main(["nobody=x"])
@@ -187,6 +190,26 @@ def test_an_agent_that_was_trained_anew_is_measured_anew(folder, monkeypatch, ca
     weights.unlink()
     assert runs.is_current(run, 4), "where the weights are not, nothing is known against them"
     assert runs.main(["--only", "mine"]) == 0 and "no weights at" in capsys.readouterr().out
+
+
+def test_the_fine_tuned_stack_has_a_row_and_its_failures_beside_what_it_came_from(folder):
+    run = baselines.JOINT.run(5)
+    options = run.options()
+    for role in ("controller", "planner"):
+        assert options[options.index(f"--{role}") + 1] == str(runs.ROOT / f"runs/baselines/joint/{role}.safetensors")
+    write(runs.CONFIGURATIONS[0], 3, 4, {})
+    write(run, 2, 4, {})
+    page = results.rebuild(folder).read_text()
+    assert "| modular, fine-tuned as a whole | o_cam, o_pr, o_pos |" in page and "50.0 % (15.0 to 85.0)" in page
+    failures = page.split("before fine-tuning as a whole and after")[1].split("##")[0]
+    assert "| default |" in failures and "| modular, fine-tuned as a whole |" in failures
+
+
+def test_every_row_is_trained_by_a_command_that_exists_with_the_same_budget(capsys):
+    for row in baselines.BASELINES:
+        assert row.command in tables.commands() and baselines.BUDGET in row.command
+        arguments = row.command.removeprefix("python -m mujoban_baselines.train ").split()
+        assert isinstance(read_options(COMMANDS, arguments, PROG), COMMANDS[arguments[0]])
 
 
 @pytest.fixture
