@@ -140,7 +140,7 @@ def _figure_2(runs: Sequence[Run], folder: Path) -> list[str]:
 
 def _baseline_curves(folder: Path) -> list[str]:
     if figures.baseline_curves(folder / "baselines.png"):
-        return ["In training, with exploration and a limit of 45 s:\n", "![Learning curves of agents](baselines.png)\n"]
+        return ["In training, with exploration, those by MPO alone with a limit of 45 s:\n", "![Learning curves of agents](baselines.png)\n"]
     return _missing("The curves of agents", "python -m benchmarks.paper.baselines NAME=RUN")
 
 

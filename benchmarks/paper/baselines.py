@@ -3,8 +3,8 @@
     python -m benchmarks.paper.baselines mpo_easy=runs/baselines/mpo_easy ...     # note what a run cost, and its curve
     python -m benchmarks.paper.runs --only mpo_easy_1 mpo_easy_5                  # evaluate its weights
 
-The first writes `baseline_<name>.jsonl`, an object a line with `step`, `cpu_seconds`, `seconds` of wall-clock, and `solved` and `return` of the
-episodes that were played in training, by difficulty.
+The first writes `baseline_<name>.jsonl`, an object a line with `step`, `cpu_seconds`, `seconds` of wall-clock, and
+`solved` and `return` of the episodes that were played in training, by difficulty.
 """
 
 from __future__ import annotations

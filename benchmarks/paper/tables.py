@@ -68,10 +68,8 @@ def baselines(modular: Run) -> str:
     """Return Table 1: the modular stack and what it is compared with, what each was trained on and how long."""
     header = ["agent", "sees", "trained on", "steps", "CPU hours", "wall-clock", "paper", "n"]
     header += [f"difficulty {d}" for d in DIFFICULTIES]
-    rows = [
-        ["modular", "o_cam, o_pr, o_pos", MODULAR_LEVELS, *[MISSING] * 3, MODULAR_PAPER]
-        + _rates([*DIFFICULTY[:-1], modular])
-    ]
+    rates = _rates([*DIFFICULTY[:-1], modular])
+    rows = [["modular", "o_cam, o_pr, o_pos", MODULAR_LEVELS, *_cost([]), MODULAR_PAPER, *rates]]
     for row in BASELINES:
         cost = _cost(points_of(row))
         rows.append([row.title, row.sees, row.levels, *cost, row.paper, *_rates([row.run(d) for d in DIFFICULTIES])])
