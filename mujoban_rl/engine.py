@@ -237,14 +237,16 @@ class Trainer(Generic[BatchT]):
         saved = evaluated = limits.time.elapsed
         if cadence.evaluate_first and not progress.updates:
             self._evaluate(log)
+        spent = True
         if not self.complete:
             self._publish(again=True)
         while not self.complete:
             if stop.requested or limits.reached(progress):
-                return False
+                spent = False
+                break
             batch = source.next_batch()
             if batch is None:
-                return True
+                break
             meter.add(self.learner.update(batch, progress.share(self.budget), self._guard))
             before, progress.samples = progress.samples, source.samples
             progress.updates += 1
@@ -253,7 +255,7 @@ class Trainer(Generic[BatchT]):
             if progress.updates % cadence.publish_updates == 0:
                 self._publish()
             if progress.updates % cadence.log_updates == 0:
-                log.scalars(progress.samples, {**meter.take(), **source.statistics(), **self._spent()})
+                self._log(log, meter)
             due = progress.samples // cadence.evaluate_samples > before // cadence.evaluate_samples
             if due or limits.time.elapsed - evaluated > cadence.evaluate_seconds:
                 self._evaluate(log)
@@ -262,7 +264,13 @@ class Trainer(Generic[BatchT]):
             if limits.time.elapsed - saved > cadence.save_seconds:
                 saved = limits.time.elapsed
                 self.save()
-        return True
+        if meter:
+            self._log(log, meter)
+        return spent
+
+    def _log(self, log: TrainingLog, meter: Meter) -> None:
+        """Log the updates and the experience since the last line."""
+        log.scalars(self.progress.samples, {**meter.take(), **self.source.statistics(), **self._spent()})
 
     def _publish(self, *, again: bool = False) -> None:
         """Hand the newest weights to the source, or `again` those that it had when the run stopped."""

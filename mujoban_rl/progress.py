@@ -82,6 +82,10 @@ class Meter:
                 self._sums[name] = self._sums.get(name, 0.0) + number
                 self._counts[name] = self._counts.get(name, 0) + 1
 
+    def __bool__(self) -> bool:
+        """Tell whether an update added something since the last call of `take`."""
+        return bool(self._counts)
+
     def take(self) -> dict[str, float]:
         """Return the means since the last call."""
         means = {name: total / self._counts[name] for name, total in self._sums.items()}

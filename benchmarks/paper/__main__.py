@@ -140,7 +140,8 @@ def _figure_2(runs: Sequence[Run], folder: Path) -> list[str]:
 
 def _baseline_curves(folder: Path) -> list[str]:
     if figures.baseline_curves(folder / "baselines.png"):
-        return ["In training, with exploration, those by MPO alone with a limit of 45 s:\n", "![Learning curves of agents](baselines.png)\n"]
+        text = "In training, with exploration; agents that learn by MPO with a limit of 45 s:\n"
+        return [text, "![Learning curves of agents](baselines.png)\n"]
     return _missing("The curves of agents", "python -m benchmarks.paper.baselines NAME=RUN")
 
 

@@ -153,6 +153,14 @@ def test_learning_curve_evaluations_and_published_versions_follow_the_cadence(tm
     assert all("cpu_seconds" in line for line in lines)
 
 
+def test_what_came_since_the_last_line_is_logged_where_a_bit_ends(tmp_path):
+    cadence = Cadence(log_updates=5)
+    for updates in (7, 10):
+        trainer(tmp_path, samples=80, cadence=cadence).run(limit_updates=updates)
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["updates"] for line in lines if "loss" in line] == [5, 7, 10]
+
+
 def test_schedules_follow_the_budget_and_a_spent_budget_trains_no_more(tmp_path):
     run = trainer(tmp_path, samples=80)
     run.run()
