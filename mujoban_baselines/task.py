@@ -87,7 +87,8 @@ class TaskConfig:
     levels: Levels = "hard"
     """Difficulties: the hardest alone, the curriculum over all of them, or the easiest alone."""
     episode_seconds: float = 45.0
-    """Time limit of episodes (paper C.5); evaluation has that of the body, 240 s for the ball."""
+    """Time limit of episodes, the paper's for partially observable agents (C.5); evaluation has that of the body, 240 s
+    for the ball."""
     robots: int = 64
     """B, of each actor."""
     body: str = "ball"

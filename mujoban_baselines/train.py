@@ -42,6 +42,8 @@ from mujoban_rl.weights import load_weights, origin, provenance
 
 PROG = "mujoban_baselines.train"
 Size = Literal["S", "M", "L"]
+WHOLE = 240.0
+"""Seconds of an episode in evaluation, for those that train without an earlier end."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,9 @@ class MPORunConfig(RunConfig):
 class VTraceRunConfig(RunConfig):
     """A run of V-trace."""
 
-    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(default_factory=lambda: TaskConfig(levels="curriculum"))
+    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: TaskConfig(levels="curriculum", episode_seconds=WHOLE)
+    )
     vtrace: VTraceTrainingConfig = field(default_factory=VTraceTrainingConfig)
 
 
@@ -95,7 +99,9 @@ class CloneRunConfig(RunConfig):
 class JointRunConfig(RunConfig):
     """A joint fine-tuning of planner and controller."""
 
-    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(default_factory=lambda: TaskConfig(robots=32))
+    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: TaskConfig(robots=32, episode_seconds=WHOLE)
+    )
     start: StartingWeights = field(default_factory=StartingWeights)
     """Weights of the four modules; by default what ships."""
     joint: Annotated[JointSettings, tyro.conf.arg(name="")] = field(default_factory=JointSettings)
