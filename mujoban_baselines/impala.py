@@ -45,9 +45,11 @@ class VTraceTrainingConfig:
     loss: VTraceConfig = field(default_factory=VTraceConfig)
 
     def __post_init__(self) -> None:
-        """Reject unrolls without a step."""
+        """Reject unrolls without a step, and numbers out of their range."""
         if self.unroll < 1:
             raise ValueError(f"unroll {self.unroll}: expected at least 1 step")
+        if not 0.0 < self.gamma <= 1.0 or not self.rate > 0.0:
+            raise ValueError(f"gamma {self.gamma}, rate {self.rate}: expected more than 0, gamma at most 1")
 
     @property
     def length(self) -> int:

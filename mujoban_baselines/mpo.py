@@ -69,8 +69,19 @@ class MPOTrainingConfig:
     """Wider bounds than Acme's, and copies sooner: updates are few here."""
 
     def __post_init__(self) -> None:
-        """Reject windows in which nothing is learned, and an odd number of samples."""
+        """Reject windows in which nothing is learned, an odd number of samples, and numbers out of their range."""
         check_samples(self.samples)
+        for name in ("windows", "n_step", "target_period"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} {getattr(self, name)}: expected at least 1")
+        for name in ("reuse", "rate"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} {getattr(self, name)}: expected more than 0")
+        if not 0.0 < self.gamma <= 1.0 or self.warm_up < 0 or self.first < 0:
+            raise ValueError(
+                f"gamma {self.gamma}, warm_up {self.warm_up}, first {self.first}: expected more than 0 and at most 1, "
+                "and at least 0 of the others"
+            )
         if self.window <= self.overlap:
             raise ValueError(
                 f"window {self.window}: expected more ticks than warm_up {self.warm_up} and n_step {self.n_step} have"

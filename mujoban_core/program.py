@@ -176,6 +176,8 @@ def _one_line(box: str) -> str:
     wrong = " ".join(sections[0]).removeprefix("Error parsing ")
     if empty := re.match(r"Missing value for argument '(--\S+)'", wrong):
         return f"{empty[1]} has no value, expected one"
+    # How tyro names what a subcommand's options are made of.
+    wrong = re.sub(r"^(?:--)?__tyro-dummy-inner__\.(?:\w+\.)*\w+: ", "", wrong)
     if "xpected" in wrong:
         return re.sub(r"^(--[\w-]+): ", r"\1 ", wrong[0].lower() + wrong[1:])
     if missing := re.match(r".*[Mm]issing from .*?: (--\S+)", wrong):

@@ -17,7 +17,15 @@ from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig
 from mujoban_baselines.networks import AgentOutput, BodySense, Recurrent, RecurrentAgent, dense
 from mujoban_baselines.squares import SquaresTask
 from mujoban_baselines.task import LEVELS, MujobanTask, TaskConfig
-from mujoban_baselines.train import MPORunConfig, VTraceRunConfig, main, make_trainer, mpo_parts, vtrace_parts
+from mujoban_baselines.train import (
+    JointRunConfig,
+    MPORunConfig,
+    VTraceRunConfig,
+    main,
+    make_trainer,
+    mpo_parts,
+    vtrace_parts,
+)
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
@@ -164,9 +172,26 @@ def test_a_run_by_command_leaves_an_agent_and_a_curve(tmp_path, capsys):
     record = json.loads((run / "agent.json").read_text())
     assert record["class"] == TopDownAgent.__name__ and record["training"]["method"] == "monolithic-vtrace"
     curve = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert record["samples"] >= 60 and curve is not None
+    assert record["samples"] >= 60 and curve[-1]["step"] == record["samples"], "what came last is in the curve"
+    assert {"solved/1", "return/1", "cpu_seconds"} <= curve[-1].keys()
     with pytest.raises(ValueError, match=r"window 9: expected more ticks"):
         replace(SMALL, window=9, warm_up=4, n_step=5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("reuse", 0.0), ("n_step", -1), ("target_period", 0), ("windows", 0), ("gamma", 1.5), ("rate", 0.0)],
+)
+def test_numbers_out_of_their_range_are_refused_by_name_before_anything_is_played(name, value):
+    option = f"--mpo.{name.replace('_', '-')}"
+    with pytest.raises(ValueError, match=rf"^{name} {value}\b.*: expected"):
+        main(["monolithic-mpo", "--run", "nowhere", option, str(value)])
+
+
+def test_v_trace_and_the_whole_stack_play_to_the_end_of_what_is_evaluated():
+    """The stack needs 82 s of difficulty 5 on average; the paper ends partially observable agents' episodes early."""
+    assert MPORunConfig().task.episode_seconds == 45.0
+    assert VTraceRunConfig().task.episode_seconds == JointRunConfig().task.episode_seconds == 240.0
 
 
 def test_symmetric_critics_teach_the_torso_and_asymmetric_ones_do_not():

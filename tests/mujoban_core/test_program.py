@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -61,6 +61,23 @@ def test_what_the_system_says_of_a_file_comes_with_what_was_expected(tmp_path, m
     Path("file").touch()
     assert exit_status("program", lambda: len(Path(path).read_text())) == 2
     assert capsys.readouterr().err == f"program: error: {said}\n"
+
+
+def test_what_an_option_of_a_subcommand_rejects_is_said_in_its_own_words():
+    @dataclass
+    class Settings:
+        reuse: float = 1.0
+
+        def __post_init__(self):
+            if self.reuse <= 0:
+                raise ValueError(f"reuse {self.reuse}: expected more than 0")
+
+    @dataclass
+    class Options:
+        settings: Settings = field(default_factory=Settings)
+
+    with pytest.raises(ValueError, match=r"^reuse 0\.0: expected more than 0$"):
+        read_options({"one": Options, "two": Options}, ["one", "--settings.reuse", "0"], "program")
 
 
 def test_an_option_of_many_subcommands_is_proposed_once():
