@@ -15,7 +15,7 @@ if __name__ == "__main__":
     end_at_once()
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_core.program import read_options, run_command
+from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.run_directory import RunDirectory
@@ -50,9 +51,8 @@ WHOLE = 240.0
 class RunConfig:
     """What must not change between the bits of a run, whatever the method."""
 
-    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(default_factory=TaskConfig)
     steps: int = 20_000_000
-    """Environment steps of all robots together at which the run is complete."""
+    """Environment steps of all robots together, or ticks of bags, at which the run is complete."""
     cpu_seconds: float = 1e9
     """CPU seconds of all its processes at which it is complete, if its steps have not come first."""
     seed: int = 0
@@ -62,9 +62,27 @@ class RunConfig:
         """When the run is complete."""
         return Budget(samples=self.steps, cpu_seconds=self.cpu_seconds)
 
+    @property
+    def data(self) -> dict[str, str]:
+        """What it learns from, as far as this says it, for the record."""
+        return {}
+
 
 @dataclass(frozen=True)
-class MPORunConfig(RunConfig):
+class PlayConfig(RunConfig):
+    """A run that learns from its own play."""
+
+    task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(default_factory=TaskConfig)
+
+    @property
+    def data(self) -> dict[str, str]:
+        """The levels that are played, and their world."""
+        levels = f"own play of generated levels ({self.task.levels}), training seeds"
+        return {"data": levels, "world": self.task.world}
+
+
+@dataclass(frozen=True)
+class MPORunConfig(PlayConfig):
     """A run of monolithic MPO."""
 
     size: Size = "S"
@@ -72,12 +90,12 @@ class MPORunConfig(RunConfig):
     critic: Literal["asymmetric", "symmetric"] = "asymmetric"
     """What the critic sees: the simulator's truth, or what the agent sees, on one torso."""
     start: Path | None = None
-    """Weights to start from, such as those of a cloning; their size counts."""
+    """Weights to start from, such as those of a cloning, of the same size."""
     mpo: MPOTrainingConfig = field(default_factory=MPOTrainingConfig)
 
 
 @dataclass(frozen=True)
-class VTraceRunConfig(RunConfig):
+class VTraceRunConfig(PlayConfig):
     """A run of V-trace."""
 
     task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(
@@ -90,13 +108,14 @@ class VTraceRunConfig(RunConfig):
 class CloneRunConfig(RunConfig):
     """A run of behaviour cloning."""
 
+    body: str = "ball"
     size: Size = "S"
     """Variant of the network."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
 
 
 @dataclass(frozen=True)
-class JointRunConfig(RunConfig):
+class JointRunConfig(PlayConfig):
     """A joint fine-tuning of planner and controller."""
 
     task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(
@@ -119,6 +138,8 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
         agent = MonolithicAgent(body, config.size)
     else:
         agent = load_weights(MonolithicAgent, config.start, body=body).train()
+        if (size := agent.config["size"]) != config.size:
+            raise ValueError(f"--size {config.size}: {config.start} holds weights of size {size}, expected that")
     build = partial(MonolithicAgent, **agent.config)
     critic: Critic = AsymmetricCritic(body) if config.critic == "asymmetric" else SymmetricCritic(body, agent.width)
     streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(2)]
@@ -149,13 +170,13 @@ def clone_parts(config: CloneRunConfig, bags: Sequence[Path]) -> Parts:
         BagError: If there is no bag at a path, or one lacks a topic.
     """
     torch.manual_seed(config.seed)  # the initial weights
-    agent = MonolithicAgent(config.task.body, config.size)
+    agent = MonolithicAgent(config.body, config.size)
     source = BagSource(bags, agent, config.cloning, np.random.default_rng(config.seed))
     return CloningLearner(agent, config.cloning), source
 
 
 def make_trainer(
-    config: RunConfig, parts: Parts, run: Path, cadence: Cadence, method: str, *, data: str | None = None,
+    config: RunConfig, parts: Parts, run: Path, cadence: Cadence, method: str, *, data: Mapping[str, Any] | None = None,
     start: str | dict[str, str] | None = None,
 ) -> Trainer[Any]:  # fmt: skip
     """Make, or resume, a run of a method.
@@ -166,7 +187,7 @@ def make_trainer(
         run: Its directory.
         cadence: How often it logs, publishes and saves.
         method: Its name.
-        data: What it learns from, if not from its own play, for the record.
+        data: What it learns from beside what `config` says, for the record.
         start: Digest of the weights that it starts from, or of each of them by name, for the record.
     """
     directory = RunDirectory(run, {**asdict(config), "method": method})
@@ -174,8 +195,8 @@ def make_trainer(
         **provenance(),
         "training": directory.config,
         "start": start,
-        "data": data or f"own play of generated levels ({config.task.levels}), training seeds",
-        "world": config.task.world,
+        **config.data,
+        **(data or {}),
     }
     return Trainer(directory, *parts, config.budget, cadence, record=record)
 
@@ -229,7 +250,8 @@ class Clone(_Command):
         if not self.bags:
             raise ValueError("--bags is missing, expected bags or folders of bags")
         parts = clone_parts(self.config, self.bags)
-        data = f"bags {', '.join(bag.name for bag in self.bags)}"
+        names = ", ".join(bag.name for bag in self.bags)
+        data = {"data": f"bags {names}", "bags_digest": bags_digest(self.bags)}
         return make_trainer(self.config, parts, self.run, self.cadence(100, 1000), "cloning", data=data)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,6 +19,7 @@ from mujoban_baselines.train import CloneRunConfig, MPORunConfig, clone_parts, m
 from mujoban_core.bodies import BALL
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES
+from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
@@ -65,10 +67,14 @@ def test_torques_are_learned_and_mpo_starts_from_them_with_its_critic(bags, tmp_
     run = tmp_path / "run"
     assert main(["clone", "--run", str(run), "--bags", str(bags), "--steps", "200", "--cloning.rows", "2"]) == 0
     settings = MPOTrainingConfig(window=6, warm_up=1, n_step=2, windows=2, replay=60, first=1, critic_first=1)
-    config = MPORunConfig(start=run / "agent.safetensors", size="L", mpo=settings)
+    record = json.loads((run / "agent.json").read_text())
+    assert record["bags_digest"] == bags_digest([bags]) and not {"world", "start"} & {k for k, v in record.items() if v}
+    assert "task" not in record["training"], "a cloning plays nothing"
+    config = MPORunConfig(start=run / "agent.safetensors", mpo=settings)
+    with pytest.raises(ValueError, match=r"--size L: .*agent\.safetensors holds weights of size S, expected that"):
+        mpo_parts(replace(config, size="L"), ActorOptions())
     learner, source = mpo_parts(config, ActorOptions(), partial(SquaresTask, batch=2))
     before = {name: values.clone() for name, values in learner.weights().items() if "normaliser" not in name}
-    assert learner.agent.config["size"] == "S", "the weights' size counts"
     source.publish(learner.weights(), 0)
     learner.update(source.next_batch(), 0.0, NaNGuard())
     assert all((learner.weights()[name] == values).all() for name, values in before.items()), "the critic learns first"
