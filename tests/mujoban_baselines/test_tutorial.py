@@ -19,7 +19,8 @@ GUIDE = (Path(__file__).parents[2] / "docs" / "baselines.md").read_text()
 def modules(tmp_path, monkeypatch):
     codes = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
     names = ("my_agent", "my_map_agent")
-    for name, code in zip(names, codes, strict=True):
+    chaser, network, loading = codes
+    for name, code in zip(names, (chaser, f"{network}\n\n{loading}"), strict=True):
         (tmp_path / f"{name}.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     yield names
@@ -34,14 +35,18 @@ def test_the_agent_of_the_tutorial_plays(modules):
     assert sum(result.episode_return > 0 for result in results) >= 1, "it pushes some box home"
 
 
-def test_the_agent_that_learns_does_so_on_the_engine(modules, tmp_path):
+def test_the_agent_that_learns_does_so_on_the_engine_and_plays(modules, tmp_path, monkeypatch):
     from importlib import import_module
 
-    trainer = import_module("my_map_agent").trainer(tmp_path / "run", steps=700)
+    monkeypatch.chdir(tmp_path)
+    trainer = import_module("my_map_agent").trainer(Path("runs/map_agent"), steps=700)
     assert trainer.run()
-    assert trainer.progress.updates >= 2 and (tmp_path / "run" / "agent.safetensors").exists()
+    assert trainer.progress.updates >= 2
+    agent = load_module("agent", "my_map_agent:trained")
+    (result,) = evaluate(AgentPolicy(agent), Episodes(1, 0, difficulty=1), time_limit=20)
+    assert result.steps == 20 and agent.privileged
 
 
 def test_every_command_of_the_guide_is_one():
-    named = set(re.findall(r"`([a-z]+(?:-[a-z]+)?) (?:--critic symmetric |--bags \S+ |--start \S+ )?--run", GUIDE))
+    named = set(re.findall(r"`([a-z]+(?:-[a-z]+)?) (?:--[a-z.-]+ \S+ )*--run", GUIDE))
     assert named == COMMANDS.keys()
