@@ -36,7 +36,7 @@ SOLVED: Final = 0.9
 """Share of episodes that must end at the red square."""
 _BETWEEN: Final = 20
 """Updates between two looks at how far it is."""
-_QUICK: Final = MPOTrainingConfig(
+QUICK: Final = MPOTrainingConfig(
     window=12,
     warm_up=2,
     windows=16,
@@ -56,7 +56,7 @@ _UNROLL: Final = VTraceTrainingConfig(unroll=10, rate=5e-4, gamma=0.9)
 
 
 def _mpo(critic: Any, seed: int) -> Parts:
-    config = MPORunConfig(seed=seed, critic=critic, mpo=_QUICK)
+    config = MPORunConfig(seed=seed, critic=critic, mpo=QUICK)
     return mpo_parts(config, ActorOptions(), partial(SquaresTask, batch=_ROBOTS))
 
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import golden
 from mujoban_baselines.actor import make_actor
 from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAgent
 from mujoban_baselines.critics import Critic
 from mujoban_baselines.impala import VTraceLearner, VTraceTrainingConfig
-from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig
+from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
 from mujoban_baselines.networks import AgentOutput, BodySense, Recurrent, RecurrentAgent, dense
 from mujoban_baselines.squares import SquaresTask
 from mujoban_baselines.task import LEVELS, MujobanTask, TaskConfig
@@ -26,7 +27,7 @@ from mujoban_baselines.train import (
     mpo_parts,
     vtrace_parts,
 )
-from mujoban_rl.actors import ActorOptions
+from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.networks import Gaussian
@@ -259,6 +260,41 @@ def test_v_trace_learns_to_walk_to_the_red_square_from_nothing():
         if update == 100:
             source.statistics()
     assert source.statistics()["solved"] > 0.8, "by chance half of the squares that are reached are red"
+
+
+class InformedCritic(Critic):
+    """Reads what the agent is told."""
+
+    sees = ("proprio",)
+
+    def __init__(self):
+        super().__init__("ball")
+        self.encoder = dense(6, 128, 128)
+
+    def state(self, batch, features):
+        return self.encoder(batch["proprio"][..., :6])
+
+
+def test_mpo_learns_to_walk_to_the_red_square_from_nothing():
+    """The same by MPO, with the settings of the golden task."""
+    torch.manual_seed(0)
+    settings = replace(golden.QUICK, windows=32, replay=6_000, first=500, samples=10)
+    learner = MPOLearner(Informed(), InformedCritic(), settings, torch.Generator().manual_seed(1))
+    factory = partial(
+        make_actor, partial(TellingSquares, batch=16), Informed, settings.window, settings.overlap,
+        InformedCritic.sees, 0,
+    )
+    store = WindowStore(settings, torch.Generator().manual_seed(2))
+    source = ActorSource(
+        ActorOptions().pool(factory), store, steps_per_update=settings.steps_per_update, first_steps=settings.first
+    )
+    for update in range(400):
+        if update % 2 == 0:
+            source.publish(learner.weights(), update)
+        learner.update(source.next_batch(), update / 400, NaNGuard())
+        if update == 350:
+            source.statistics()
+    assert source.statistics()["solved"] > 0.7, "by chance half of the squares that are reached are red"
 
 
 def test_a_mean_beyond_the_limits_is_led_back_where_no_reward_does_so():
