@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -23,7 +23,6 @@ from benchmarks.paper.curves import read_metrics
 from benchmarks.paper.runs import ROOT, ResultError, Run
 from mujoban_core.files import write_atomically
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_core.plugins import AGENT
 from mujoban_core.program import read_options, run_command
 
 PROG: Final = "benchmarks.paper.baselines"
@@ -65,9 +64,12 @@ class Baseline:
 
     def run(self, difficulty: int) -> Run:
         """Return its evaluation at a difficulty."""
-        roles = ("controller", "planner") if self.modules else (AGENT,)
-        weights = {role: self.folder / f"{role}.safetensors" for role in roles}
-        return Run(f"{self.name}_{difficulty}", self.title, difficulty, **weights)
+        run = Run(f"{self.name}_{difficulty}", self.title, difficulty)
+        if not self.modules:
+            return replace(run, agent=self.folder / "agent.safetensors")
+        return replace(
+            run, controller=self.folder / "controller.safetensors", planner=self.folder / "planner.safetensors"
+        )
 
 
 HOURS: Final = 8.0
