@@ -209,6 +209,9 @@ class Trainer(Generic[BatchT]):
 
         Returns:
             Whether the run is complete.
+
+        Raises:
+            Interrupted: If a signal came; the run is saved then.
         """
         children.end_with_parent()
         samples = min(self.budget.samples, limit_samples)
@@ -226,6 +229,8 @@ class Trainer(Generic[BatchT]):
             if stop.requested:
                 done = f"{readable(self.progress.samples)} samples"
                 say(f"{self.directory.path}: interrupted after {done}; the same command goes on from there")
+                # Whoever waits for the command, such as make, is not to take what is half trained for done.
+                stop.check()
         finally:
             self.source.close()
         return spent

@@ -69,6 +69,22 @@ def test_a_stopped_run_ends_its_commands_and_goes_on_where_it_was(tmp_path):
     assert again.entries["train"].seconds > run.entries["train"].seconds > 0
 
 
+def test_a_trainer_that_is_stopped_alone_is_not_done(tmp_path):
+    folder = tmp_path / "train"
+    product, metrics = folder / "planner.safetensors", folder / "metrics.jsonl"
+    small = ("--channels", "8", "--blocks", "1", "--run", str(folder))
+    run = Pipeline(tmp_path, [Stage("train", ("-m", "mujoban_planner.train", "expert-iteration", *small), (product,))])
+
+    def stop_trainer(pipeline):
+        for process, _ in pipeline._running.values():
+            if metrics.exists():
+                process.send_signal(signal.SIGTERM)
+
+    with pytest.raises(PipelineError, match="stage train ended with 143; .*the same command goes on from there"):
+        run.run(stop_trainer)
+    assert product.exists() and not run.done
+
+
 def test_a_failing_command_is_named_with_the_end_of_its_log(tmp_path):
     stage = Stage("broken", ("-c", "import sys; sys.exit('no bags here')"), (tmp_path / "x",))
     with pytest.raises(PipelineError, match=r"stage broken ended with 1; .*broken\.txt ends: no bags here"):

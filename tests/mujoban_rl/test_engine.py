@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import nn
 
+from mujoban_core.signals import Interrupted
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
@@ -106,7 +107,9 @@ def test_a_run_interrupted_by_a_signal_and_resumed_equals_one_that_never_stopped
     assert whole.run()
     kill = Noise(on_batch=lambda n: os.kill(os.getpid(), signal.SIGTERM) if n == 17 else None)
     first = trainer(tmp_path / "parts", kill)
-    assert not first.run() and first.progress.updates == 17 and kill.closed
+    with pytest.raises(Interrupted) as stopped:
+        first.run()
+    assert stopped.value.status == 143 and first.progress.updates == 17 and kill.closed
     assert "parts: interrupted after" in capsys.readouterr().err
     second = trainer(tmp_path / "parts")
     assert second.progress.updates == 17 and second.run()
