@@ -28,7 +28,7 @@ from bringup.pipeline import Pipeline, Stage
 from bringup.training_report import write_report
 from mujoban_core.program import read_options, run_command
 from mujoban_sim.presets import DEFAULT_WORLD
-from mujoban_sokoban.generator import TRAIN_SEEDS, VALIDATION_SEEDS
+from mujoban_sokoban.generator import FRESH_SEEDS, TRAIN_SEEDS
 
 PROG = "bringup.train_all"
 WEIGHTS: Final = {
@@ -233,7 +233,7 @@ def _evaluation(options: Options) -> Stage:
     weights = tuple(x for role, path in WEIGHTS.items() for x in (f"--{role}", str(run / path)))
     command = (
         "-m", "bringup.evaluate", "--difficulty", "5", "--episodes", str(options.evaluation_episodes),
-        "--seed", str(VALIDATION_SEEDS.start), "--world", options.world, "--json", str(run / "evaluation.json"),
+        "--seed", str(FRESH_SEEDS.start), "--world", options.world, "--json", str(run / "evaluation.json"),
         *weights,
     )  # fmt: skip
     needs = ("estimator_second", "planner_views", "controller_mpo")

@@ -17,9 +17,10 @@ from bringup.model_card import Place, Score, card
 from bringup.pipeline import Pipeline
 from mujoban_core.files import write_atomically
 from mujoban_core.text import readable
+from mujoban_sokoban.generator import FRESH_SEEDS
 
 _PREFIX = "evaluation/"
-_PLACE = Place("python -m bringup.train_all", None, "levels for validation")
+_PLACE = Place("python -m bringup.train_all", None, "levels for validation by which nothing was chosen")
 
 
 def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> Path:
@@ -99,7 +100,8 @@ def _summary(report: Mapping[str, Any] | None, pipeline: Pipeline) -> Iterator[s
         yield ""
         yield (
             f"The four modules solve **{report['success_rate']:.1%}** of {len(report['episodes'])} validation levels "
-            f"of difficulty 5 (95 % interval {low:.1%} to {high:.1%}), mean return {report['mean_return']:.2f}. "
+            f"of difficulty 5, seeds from {FRESH_SEEDS.start}, by which no stage chooses what it keeps (95 % interval "
+            f"{low:.1%} to {high:.1%}), mean return {report['mean_return']:.2f}. "
             f"Failures: {', '.join(f'{v} {k}' for k, v in report['failures'].items()) or 'none'}."
         )
 

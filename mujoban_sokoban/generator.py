@@ -27,6 +27,8 @@ TEST_SEEDS: Final = range(0, 5_000_000)
 """Seeds of results, and of what users play: never of training, and for tuning there are others."""
 VALIDATION_SEEDS: Final = range(5_000_000, 10_000_000)
 """Seeds for tuning: to be looked at as often as one likes."""
+FRESH_SEEDS: Final = range(7_000_000, 8_000_000)
+"""Those of validation by which no trainer chooses what it keeps: what `make weights` reports is measured on them."""
 TRAIN_SEEDS: Final = range(10_000_000, 2**62)
 """Seeds of training."""
 

@@ -13,6 +13,7 @@ from bringup.pipeline import Pipeline
 from bringup.train_all import PRODUCTS, WEIGHTS, Options, stages
 from bringup.training_report import write_report
 from mujoban_core.program import read_options
+from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range
 
 
 def commands(options: Options) -> dict[str, tuple[str, ...]]:
@@ -73,6 +74,15 @@ def test_a_run_whose_bags_are_gone_is_continued_with_new_ones_alone(tmp_path: Pa
     assert first[first.index("--bags") + 1 : first.index("--out")] == (str(run / PRODUCTS["first"]),)
 
 
+def test_the_evaluation_plays_levels_by_which_nothing_is_chosen(tmp_path: Path) -> None:
+    command = commands(Options(run=tmp_path))["evaluation"]
+    seed, episodes = (int(command[command.index(option) + 1]) for option in ("--seed", "--episodes"))
+    played = range(seed, seed + episodes)
+    # Controllers keep what solves most of the first levels for validation, planners of those from 9,000,000 on.
+    chosen_by = (range(VALIDATION_SEEDS.start, VALIDATION_SEEDS.start + 64), range(9_000_000, VALIDATION_SEEDS.stop))
+    assert seed_range(seed, episodes) == "validation" and not any(set(played) & set(seeds) for seeds in chosen_by)
+
+
 def test_continuing_what_is_not_finished_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"--continue .* lacks .*, expected the directory of a finished run"):
         Options(run=tmp_path / "run", before=tmp_path)
@@ -104,6 +114,7 @@ def test_the_report_stands_beside_weights_with_their_cards(tmp_path: Path) -> No
     (tmp_path / "evaluation.json").write_text(json.dumps(outcome))
     options = Options(run=tmp_path)
     text = write_report(tmp_path, Pipeline(tmp_path, stages(options)), WEIGHTS).read_text()
-    assert "**50.0%** of 2 validation levels" in text and "success_rate/5 0.75" in text
+    assert "**50.0%** of 2 validation levels of difficulty 5, seeds from 7000000, by which no stage chooses" in text
+    assert "success_rate/5 0.75" in text
     card = (tmp_path / "weights" / "planner.md").read_text()
     assert "| all four modules | none | 2 | 50.0 % | 10.0 to 90.0 % |" in card and "| success_rate/5 | 0.75 |" in card
