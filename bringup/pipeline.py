@@ -7,12 +7,14 @@ every trainer of this project resumes from its directory.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,12 +78,13 @@ class Pipeline:
             cores: Stages run side by side while their cores do not add up to more; each runs alone if it wants more.
 
         Raises:
-            PipelineError: If a need names no stage before it, or a stage that is done had another command.
+            PipelineError: If a need names no stage before it, a stage that is done had another command, or the record
+                of the run is damaged.
         """
         self.directory, self.stages, self.cores = directory, tuple(stages), cores
         self._file = directory / "pipeline.json"
-        stored: dict[str, Any] = json.loads(self._file.read_text()) if self._file.exists() else {}
-        self.entries = {s.name: Entry(**stored[s.name]) if s.name in stored else Entry() for s in self.stages}
+        stored = _stored(self._file)
+        self.entries = {s.name: stored.get(s.name, Entry()) for s in self.stages}
         known: set[str] = set()
         for stage in self.stages:
             if missing := [need for need in stage.needs if need not in known]:
@@ -119,10 +122,11 @@ class Pipeline:
             on_tick: Called several times a second, to show progress.
 
         Raises:
-            PipelineError: If a command fails or does not make what it should; the others are stopped.
+            PipelineError: If a command fails or does not make what it should; the others are stopped. Or if another
+                process runs the stages of this directory.
             Interrupted: If a signal came; the commands were stopped and have kept their checkpoints.
         """
-        with StopSignal() as stop:
+        with _alone(self.directory), StopSignal() as stop:
             try:
                 while not self.done:
                     stop.check()
@@ -196,6 +200,28 @@ class Pipeline:
         self.directory.mkdir(parents=True, exist_ok=True)
         content: Mapping[str, Any] = {name: asdict(entry) for name, entry in self.entries.items() if entry.command}
         write_atomically(self._file, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def _stored(file: Path) -> dict[str, Entry]:
+    """Return what the record of a run holds, by stage; nothing if there is no record yet."""
+    if not file.exists():
+        return {}
+    try:
+        return {name: Entry(**entry) for name, entry in json.loads(file.read_text()).items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise PipelineError(f"{file}: {error}; expected the record of a run as it was written") from error
+
+
+@contextmanager
+def _alone(directory: Path) -> Iterator[None]:
+    """Keep other processes from running the stages of a directory; the system frees it however this one ends."""
+    directory.mkdir(parents=True, exist_ok=True)
+    with (directory / "lock").open("ab") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise PipelineError(f"{directory}: another process runs its stages, expected another directory") from None
+        yield
 
 
 def _remove(paths: Sequence[Path]) -> None:

@@ -126,6 +126,26 @@ def test_stages_without_needs_run_side_by_side_up_to_the_cores(tmp_path):
     assert a.exists() and b.exists()
 
 
+@pytest.mark.parametrize("text", ["{", "[]", '{"first": {"unknown": 1}}', '{"first": 1}'])
+def test_a_damaged_record_is_named(tmp_path, text):
+    (tmp_path / "pipeline.json").write_text(text)
+    with pytest.raises(PipelineError, match=r"pipeline\.json: .*expected the record of a run as it was written"):
+        Pipeline(tmp_path, stages(tmp_path))
+
+
+def test_two_runs_of_one_directory_are_refused(tmp_path):
+    refused = []
+
+    def run_again(pipeline):
+        with pytest.raises(PipelineError, match="another process runs its stages, expected another directory"):
+            Pipeline(tmp_path, stages(tmp_path)).run()
+        refused.append(pipeline.running())
+
+    Pipeline(tmp_path, stages(tmp_path)).run(run_again)
+    assert refused and (tmp_path / "b.txt").read_text() == "ab"
+    Pipeline(tmp_path, stages(tmp_path)).run()
+
+
 def test_a_need_that_is_no_earlier_stage_is_refused(tmp_path):
     with pytest.raises(PipelineError, match="stage second needs first"):
         Pipeline(tmp_path, stages(tmp_path)[1:])
