@@ -15,6 +15,7 @@ if __name__ == "__main__":
 
     end_at_once()
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,10 +25,11 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from bringup.options import Count, one_of, whole
 from bringup.pipeline import Pipeline, Stage
 from bringup.training_report import write_report
 from mujoban_core.program import read_options, run_command
-from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 from mujoban_sokoban.generator import FRESH_SEEDS, TRAIN_SEEDS
 
 PROG = "bringup.train_all"
@@ -83,6 +85,8 @@ _VIEWS: Final = ("--noise", "0.1", "--hidden", "0.3")
 """Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
 _STREAMS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
+_LAST_SEED: Final = 2**31 - 1
+"""The largest of a run: NumPy and torch take it, and every recording's levels are among those for training."""
 
 
 @dataclass(frozen=True)
@@ -96,17 +100,19 @@ class Options:
     before: Annotated[Path | None, tyro.conf.arg(name="continue")] = None
     """Directory of a finished run: every module goes on from its weights, and learns also from its bags, if they are
     still there."""
-    world: str = DEFAULT_WORLD
-    """Physical world: reference or eased."""
-    seed: int = 0
-    cores: int = 2
-    evaluation_episodes: int = 128
+    world: Annotated[str, one_of(WORLDS)] = DEFAULT_WORLD
+    """Physical world."""
+    seed: Annotated[int, whole("N", 0)] = 0
+    cores: Count = 2
+    evaluation_episodes: Count = 128
     """Validation levels that each table of the report counts."""
 
     def __post_init__(self) -> None:
-        """Reject times in which nothing can be learned."""
-        if not self.hours > 0:
+        """Reject times in which nothing can be learned, and seeds past those for training."""
+        if not 0 < self.hours < math.inf:
             raise ValueError(f"--hours {self.hours}: expected a positive number")
+        if not 0 <= self.seed <= _LAST_SEED:
+            raise ValueError(f"--seed {self.seed}: expected a whole number from 0 to {_LAST_SEED}")
         needed = (path for name, path in PRODUCTS.items() if name not in _BAGS)
         missing = [] if self.before is None else [path for path in needed if not (self.before / path).exists()]
         if missing:
