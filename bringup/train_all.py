@@ -196,6 +196,7 @@ def _senses(options: Options) -> list[Stage]:
     earlier = [] if options.before is None else [options.before / PRODUCTS[name] for name in _BAGS]
     bags = [str(folder) for folder in earlier if folder.exists()]
     start = None if options.before is None else (options.before / PRODUCTS["estimator"]).parent
+    needs: list[str] = []
     for round_ in _BAGS:
         recording = f"bags_{round_}"
         found.append(_recording(options, recording))
@@ -207,7 +208,9 @@ def _senses(options: Options) -> list[Stage]:
         if start is not None:
             command += ["--start", str(start)]
         start = out
-        found.append(_trainer(options, name, command, f"{name}/weights", recording))
+        needs.append(recording)
+        found.append(_trainer(options, name, command, f"{name}/weights", *needs))
+        needs.append(name)
     return found
 
 

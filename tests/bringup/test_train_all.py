@@ -37,15 +37,11 @@ def test_a_run_begins_from_nothing(tmp_path: Path) -> None:
         assert "--initial" not in begun or name == "controller_mpo"
 
 
-def test_a_stage_reads_only_what_the_stages_that_it_needs_have_made(tmp_path: Path) -> None:
+def test_a_stage_needs_all_whose_products_it_reads(tmp_path: Path) -> None:
     found = {stage.name: stage for stage in stages(Options(run=tmp_path))}
-
-    def made(name: str) -> set[str]:
-        return {str(p) for p in found[name].products}.union(*(made(need) for need in found[name].needs))
-
     read = 0
     for stage in found.values():
-        before = set[str]().union(*(made(need) for need in stage.needs))
+        before = {str(p) for need in stage.needs for p in found[need].products}
         own = {str(tmp_path / stage.name), *map(str, stage.products)}
         named = [x for x in stage.command if x.startswith(str(tmp_path)) and x not in own]
         assert all(any(x == y or x.startswith(f"{y}/") for y in before) for x in named), (stage.name, named)
@@ -81,6 +77,22 @@ def test_the_evaluation_plays_levels_by_which_nothing_is_chosen(tmp_path: Path) 
     # Controllers keep what solves most of the first levels for validation, planners of those from 9,000,000 on.
     chosen_by = (range(VALIDATION_SEEDS.start, VALIDATION_SEEDS.start + 64), range(9_000_000, VALIDATION_SEEDS.stop))
     assert seed_range(seed, episodes) == "validation" and not any(set(played) & set(seeds) for seeds in chosen_by)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("--hours", "inf", "a positive number"),
+        ("--evaluation-episodes", "0", "a whole number from 1 on"),
+        ("--cores", "0", "a whole number from 1 on"),
+        ("--world", "moon", "one of "),
+        ("--seed", "-1", "a whole number from 0 on"),
+        ("--seed", "10000000000", "a whole number from 0 to 2147483647"),
+    ],
+)
+def test_bad_options_are_refused_before_anything_runs(option: str, value: str, expected: str) -> None:
+    with pytest.raises(ValueError, match=f"{option} .*{value}.* expected {expected}"):
+        read_options(Options, [option, value], "train_all")
 
 
 def test_continuing_what_is_not_finished_is_refused(tmp_path: Path) -> None:
