@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import bringup.evaluate
+import bringup.record
 import mujoban_controller.train
 import mujoban_estimator.train
+import mujoban_planner.train
 from bringup.pipeline import Pipeline
 from bringup.train_all import PRODUCTS, WEIGHTS, Options, stages
 from bringup.training_report import write_report
@@ -101,16 +105,18 @@ def test_continuing_what_is_not_finished_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("continued", [False, True])
-def test_trainers_know_the_options_that_they_are_given(tmp_path: Path, continued: bool) -> None:
+def test_programs_know_the_options_that_they_are_given(tmp_path: Path, continued: bool) -> None:
     before = finished(tmp_path / "before") if continued else None
-    programs = {
+    programs: dict[str, Any] = {
         "mujoban_controller.train": mujoban_controller.train.Options,
         "mujoban_estimator.train": mujoban_estimator.train.Options,
+        "mujoban_planner.train": {"expert-iteration": mujoban_planner.train.ExpertIteration},
+        "bringup.record": bringup.record.Options,
+        "bringup.evaluate": bringup.evaluate.Options,
     }
     for name, command in commands(Options(run=tmp_path / "run", before=before)).items():
-        if command[1] in programs:
-            options = read_options(programs[command[1]], command[2:], name)
-            assert options.run == tmp_path / "run" / name
+        options = read_options(programs[command[1]], command[2:], name)
+        assert getattr(options, "run", tmp_path / "run" / name) == tmp_path / "run" / name
 
 
 def test_the_report_stands_beside_weights_with_their_cards(tmp_path: Path) -> None:
