@@ -39,7 +39,7 @@ def _learn_from(experience: Experience, kind: str) -> None:
 def _record(folder: Path) -> None:
     """Record episodes that begin in the middle, one at a time: arrays of one row are of another type than of many."""
     episodes = MixedEpisodes(4, TRAIN_SEEDS.start, (3,), advanced=1.0)
-    record(Job(folder, "", episodes, Stack(), Disturbance(wander=1.0), batch=1, time_limit=40, seed=0))
+    record(Job(folder, "", episodes, Stack(), Disturbance(wander=1.0), batch=1, time_limit=40, run_seed=0))
 
 
 def main() -> int:

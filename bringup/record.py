@@ -116,6 +116,8 @@ class Options:
     """Of the first episode; by default the first for training."""
     allow_test_seeds: bool = False
     """Record also levels that are not for training."""
+    run_seed: Annotated[int, whole("N", 0)] = 0
+    """Of the randomness of modules and disturbances, which follows from no level's seed."""
     advanced: float = 0.5
     """Share of episodes that begin along a solution."""
     time_limit: Annotated[int, whole("STEPS", 0)] = 600
@@ -152,7 +154,8 @@ class Job:
     disturbance: Disturbance | None
     batch: int
     time_limit: int | None
-    seed: int
+    run_seed: int
+    """Of the randomness of modules and disturbances; each process has its own."""
     world: str = DEFAULT_WORLD
 
 
@@ -173,7 +176,7 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
     set_threads(job.stack.threads)
     policy: SensePlanAct = job.stack.policy()
     if job.disturbance is not None:
-        policy = disturbed(policy, job.disturbance, np.random.default_rng(job.seed))
+        policy = disturbed(policy, job.disturbance, np.random.default_rng(job.run_seed))
     world = World(
         min(job.batch, len(job.episodes)), body=job.stack.body, world=job.world, time_limit=job.time_limit,
         threads=job.stack.threads,
@@ -182,7 +185,7 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
     recorder = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix, world=job.world)
     with StopSignal(deferred=False) as stop:
         try:
-            for tick in ticks(policy, world, job.episodes, camera=True, run_seed=job.seed):
+            for tick in ticks(policy, world, job.episodes, camera=True, run_seed=job.run_seed):
                 stop.deferred = True
                 recorder.write(tick, stop.check)
                 stop.deferred = False
@@ -337,7 +340,7 @@ def _job(options: Options, seed: int, part: int) -> Job:
         disturbance=None if options.undisturbed else Disturbance(),
         batch=options.batch,
         time_limit=options.time_limit or None,
-        seed=seed + part,
+        run_seed=int(np.random.SeedSequence([options.run_seed, part]).generate_state(1)[0]),
         world=options.physics.world,
     )
 

@@ -228,10 +228,11 @@ def _recording(options: Options, name: str) -> Stage:
     sense = ("--oracle", "estimator,termination") if first else ()
     modules = tuple(x for role, path in acting.items() for x in (f"--{role}", str(run / path)))
     episodes = max(8, round(_EPISODES_PER_HOUR * options.hours))
-    seed = TRAIN_SEEDS.start + (len(_STREAMS) * options.seed + _STREAMS[name]) * 10**9
+    stream = len(_STREAMS) * options.seed + _STREAMS[name]
+    seed = TRAIN_SEEDS.start + stream * 10**9
     command = (
         "-m", "bringup.record", "--out", str(run / name), "--episodes", str(episodes),
-        "--seed", str(seed), "--time-limit", str(_RECORDED_STEPS),
+        "--seed", str(seed), "--run-seed", str(stream), "--time-limit", str(_RECORDED_STEPS),
         "--processes", str(cores), "--world", options.world, *sense, *modules,
     )  # fmt: skip
     return Stage(name, command, (run / name,), tuple(needs.values()), _seconds(options, name), cores, resumes=False)

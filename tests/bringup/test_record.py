@@ -7,7 +7,7 @@ import pytest
 from bringup import cluster
 from bringup import record as recording
 from bringup.command import Choice, Stack
-from bringup.record import Job, MixedEpisodes, record
+from bringup.record import Job, MixedEpisodes, Options, _job, record
 from mujoban_core.plugins import ROLES
 from mujoban_core.signals import Interrupted, interruptible
 from mujoban_sim.world import World
@@ -89,3 +89,12 @@ def test_a_recording_on_a_cluster_asks_for_the_gpu_that_it_uses(tmp_path, monkey
         job = Job(tmp_path, "", MixedEpisodes(1, TRAIN_SEEDS.start, [1]), stack, None, 1, 2, 0)
         assert recording._record_all([job, job], cluster.HERE, lambda _: None) == 10
     assert asked == [(3.0, 0.0), (3.0, 1.0)]
+
+
+def test_the_randomness_of_modules_follows_from_no_levels_seed(tmp_path):
+    def drawn(seed, run_seed=0):
+        options = Options(tmp_path, run_seed=run_seed, processes=2)
+        return [_job(options, seed, part).run_seed for part in range(2)]
+
+    assert drawn(10_000_000) == drawn(20_000_000)
+    assert len({*drawn(10_000_000), *drawn(10_000_000, 1)}) == 4
