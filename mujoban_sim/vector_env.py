@@ -145,28 +145,34 @@ class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]
             raise RuntimeError(f"environments {np.flatnonzero(self._ended).tolist()} have ended: reset them first")
         world.step(np.asarray(actions))
         rewards = world.reward.astype(np.float64)
-        every = np.ones(self.num_envs, np.bool_)
-        infos: dict[str, Any] = {
-            "solved": world.solved.copy(), "_solved": every,
-            "boxes_on_target": world.boxes_on_target.copy(), "_boxes_on_target": every.copy(),
-        }  # fmt: skip
-        if mode == AutoresetMode.NEXT_STEP and self._ended.any():
+        infos: dict[str, Any] = {}
+        restarted = self._ended.copy()
+        if restarted.any():
             # The rows that ended in the step before ignore their action and start anew, without reward.
-            infos |= self._restart(np.flatnonzero(self._ended), [None] * self.num_envs)
+            infos = self._restart(np.flatnonzero(restarted), [None] * self.num_envs)
         terminations, truncations = world.solved.copy(), world.truncated.copy()
         self._ended = terminations | truncations
         if mode == AutoresetMode.SAME_STEP and self._ended.any():
-            infos |= self._final(infos)
-            infos |= self._restart(np.flatnonzero(self._ended), [None] * self.num_envs)
-        return observe(world, self._names), rewards, terminations, truncations, infos
+            restarted = self._ended.copy()
+            infos = self._final()
+            infos |= self._restart(np.flatnonzero(restarted), [None] * self.num_envs)
+        return observe(world, self._names), rewards, terminations, truncations, infos | self._outcomes(~restarted)
 
-    def _final(self, infos: dict[str, Any]) -> dict[str, Any]:
+    def _outcomes(self, stepped: NDArray[np.bool_]) -> dict[str, Any]:
+        """Return the infos of a step, of the rows that took one; others have those of a reset."""
+        on_target = np.where(stepped, self.world.boxes_on_target, 0)
+        return {
+            "solved": self.world.solved & stepped, "_solved": stepped,
+            "boxes_on_target": on_target, "_boxes_on_target": stepped.copy(),
+        }  # fmt: skip
+
+    def _final(self) -> dict[str, Any]:
         """Return the last observations and infos of the episodes that have just ended."""
         observations = observe(self.world, self._names)
         final: dict[str, Any] = {}
         for row in np.flatnonzero(self._ended).tolist():
             last = {name: values[row].copy() for name, values in observations.items()}
-            info = {name: infos[name][row] for name in ("solved", "boxes_on_target")}
+            info = {"solved": self.world.solved[row], "boxes_on_target": self.world.boxes_on_target[row]}
             final = self._add_info(final, {"final_obs": last, "final_info": info}, row)
         return final
 

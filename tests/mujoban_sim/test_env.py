@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import mujoban_sim  # noqa: F401 - registers the environment
+from mujoban_core.grid import cell_to_xy
 from mujoban_sim.checks import TorqueError
 from mujoban_sim.env import OBSERVATION_SETS, MujobanEnv
 from mujoban_sim.vector_env import MujobanVectorEnv
@@ -111,11 +112,16 @@ def test_render_shows_the_grid_from_above():
     env.close()
 
 
+def row_infos(infos, i):
+    """The infos of environment i, as a single one would give them."""
+    return {name: infos[name][i] for name in ("seed", "level", "solved", "boxes_on_target") if infos.get(f"_{name}", [False] * (i + 1))[i]}
+
+
 def test_vectorised_environments_behave_as_single_ones():
     options = {"observations": "state", "time_limit": 7, "difficulty": 2}
     vector = gymnasium.make_vec("Mujoban-v0", 3, vectorization_mode="vector_entry_point", threads=2, **options)
     singles = [MujobanEnv(**options) for _ in range(3)]
-    observation, _ = vector.reset(seed=5)
+    observation, infos = vector.reset(seed=5)
     expected = [env.reset(seed=5 + i)[0] for i, env in enumerate(singles)]
     ended = [False] * 3
     rng = np.random.default_rng(0)
@@ -123,14 +129,33 @@ def test_vectorised_environments_behave_as_single_ones():
         for i, single in enumerate(expected):
             assert all(np.array_equal(single[name], observation[name][i]) for name in single)
         actions = rng.uniform(-1, 1, (3, 2)).astype(np.float32)
-        observation, rewards, terminated, truncated, _ = vector.step(actions)
+        observation, rewards, terminated, truncated, infos = vector.step(actions)
         for i, env in enumerate(singles):
             if ended[i]:
-                expected[i], reward, ended[i] = env.reset()[0], 0.0, False
+                (expected[i], info), reward, ended[i] = env.reset(), 0.0, False
             else:
-                expected[i], reward, end, cut, _ = env.step(actions[i])
+                expected[i], reward, end, cut, info = env.step(actions[i])
                 ended[i] = end or cut
             assert reward == rewards[i] and ended[i] == (terminated[i] or truncated[i])
+            assert row_infos(infos, i) == info
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_a_solved_episode_is_reported_once(mode, tmp_path):
+    path = tmp_path / "levels.txt"
+    path.write_text(CORRIDOR)
+    env = MujobanVectorEnv(2, observations="state", level_file=path, autoreset_mode=mode)
+    env.reset(seed=0)
+    # The box of row 0 is put on the pad, that of row 1 stays where it is.
+    boxes = env.world.box_position.copy()
+    boxes[0, 0] = cell_to_xy(np.argwhere(env.world.target[0])[0])
+    env.world.place([0, 1], env.world.pose, boxes)
+    still, reports = np.zeros((2, 2), np.float32), []
+    for _ in range(3):
+        *_, infos = env.step(still)
+        reports += [row_infos(part, 0) for part in (infos, infos.get("final_info")) if part]
+    assert sum(report.get("solved", False) for report in reports) == 1
+    assert sum(report.get("boxes_on_target", 0) for report in reports) == 1
 
 
 def test_same_step_autoreset_hands_over_the_last_observation():
