@@ -25,7 +25,7 @@ from mujoban_estimator.odometry import Track
 from mujoban_estimator.termination import ControlTermination, TerminationConfig, true_phases
 from mujoban_rl.engine import Learner, State
 from mujoban_rl.limits import NaNGuard
-from mujoban_rl.optimise import ProgressSchedule, guarded_step
+from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_linear
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import load_weights, save_weights
@@ -75,13 +75,14 @@ class TrainConfig:
     length: int = 64
     """Ticks of a stretch, a multiple of `update_every`."""
     steps: int = 20_000
-    """Steps of the run, and of the learning-rate schedule."""
+    """Most steps of the run."""
     cpu_seconds: float = 1e9
     """CPU seconds of training at which the run is complete, if its steps have not come first."""
     learning_rate: float = 1.5e-3
-    warm_up: int = 50
+    warm_up: float = 0.0025
+    """Share of the budget, of steps or CPU seconds, within which the learning rate rises from 0."""
     final_rate: float = 0.03
-    """Learning rate at the last step, as a share of `learning_rate`; it falls linearly."""
+    """Learning rate at the end of the budget, as a share of `learning_rate`; it falls linearly."""
     clip: float = 1.0
     """Largest norm of the gradient."""
     seed: int = 0
@@ -93,11 +94,9 @@ class TrainConfig:
             raise ValueError(f"length is {self.length}: expected a multiple of update_every, {every}")
         if self.streams < 1 or self.steps < 1:
             raise ValueError(f"{self.streams} streams, {self.steps} steps: expected at least 1")
-
-    def rate(self, progress: float) -> float:
-        """Return the learning rate as a share of `learning_rate`: linear warm-up, then linear decay."""
-        decay = max(self.final_rate, 1.0 - progress)
-        return min(1.0, (progress * self.steps + 1) / self.warm_up) * decay
+        for name in ("warm_up", "final_rate"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} is {getattr(self, name)}: expected a share from 0 to 1")
 
 
 class EstimatorLearner(Learner[Batch]):
@@ -122,7 +121,7 @@ class EstimatorLearner(Learner[Batch]):
         self.termination = ControlTermination(self.estimator.encoder, **vars(self.config.termination)).to(self.device)
         both = {id(p): p for module in self.modules.values() for p in module.parameters()}
         self.optimiser = torch.optim.Adam(both.values(), config.learning_rate)
-        self._schedule = ProgressSchedule(self.optimiser, config.rate)
+        self._schedule = ProgressSchedule(self.optimiser, warm_up_linear(config.warm_up, config.final_rate))
         self._validation, self._out = list(validation), out
         self._belief = self.estimator.initial_belief(config.streams)
         self._track = self._lost_track(config.streams)

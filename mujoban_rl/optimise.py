@@ -79,10 +79,22 @@ def warm_up_cosine(warm_up: float) -> Callable[[float], float]:
     """Return a schedule that rises over a share `warm_up` of the budget and falls to 0 along a half cosine."""
 
     def factor(progress: float) -> float:
-        rise = min(1.0, progress / warm_up) if warm_up > 0 else 1.0
-        return rise * 0.5 * (1.0 + math.cos(math.pi * progress))
+        return _rise(progress, warm_up) * 0.5 * (1.0 + math.cos(math.pi * progress))
 
     return factor
+
+
+def warm_up_linear(warm_up: float, last: float) -> Callable[[float], float]:
+    """Return a schedule that rises over a share `warm_up` of the budget and falls linearly, down to `last`."""
+
+    def factor(progress: float) -> float:
+        return _rise(progress, warm_up) * max(last, 1.0 - progress)
+
+    return factor
+
+
+def _rise(progress: float, warm_up: float) -> float:
+    return min(1.0, progress / warm_up) if warm_up > 0 else 1.0
 
 
 class MovingAverage(AveragedModel, Generic[ModuleT]):

@@ -202,7 +202,7 @@ def test_missed_steps_count_earlier_negatives_under_a_positive_label():
 
 
 def test_a_learner_fits_what_it_sees_again_and_again():
-    config = TrainConfig(LearnerConfig(window_frames=16), streams=1, learning_rate=3e-3, warm_up=1)
+    config = TrainConfig(LearnerConfig(window_frames=16), streams=1, learning_rate=3e-3, warm_up=0.0)
     learner = EstimatorLearner(config)
     batch = next(Batcher([iter([stretch(16, terminated=(8,), completed=(7, 14, 15))])], 16, BALL))
     before = learner.loss(batch)[0].item()
@@ -218,10 +218,22 @@ def test_estimator_and_termination_must_share_the_resnet():
     assert learner.estimator.encoder is learner.termination.encoder
 
 
-def test_the_learning_rate_warms_up_and_falls():
-    config = TrainConfig(steps=1000, warm_up=10, final_rate=0.1)
-    assert config.rate(0.0) == pytest.approx(0.1) and config.rate(0.5) == pytest.approx(0.5)
-    assert config.rate(1.0) == pytest.approx(0.1)
+@pytest.mark.parametrize("steps", [1000, 10**12])
+def test_the_learning_rate_warms_up_and_falls_over_whichever_budget_there_is(steps):
+    """A run whose CPU seconds are what ends it, as those of `make weights`, warms up as well."""
+    learner = EstimatorLearner(TrainConfig(steps=steps, learning_rate=2.0, warm_up=0.1, final_rate=0.1))
+    batch = next(Batcher([iter([stretch(4)] * 4) for _ in range(4)], 4, BALL))
+    rates = []
+    for progress in (0.0, 0.05, 0.5, 1.0):
+        learner.update(batch._replace(proprio=batch.proprio * np.nan), progress, NaNGuard())
+        rates.append(learner.optimiser.param_groups[0]["lr"])
+    assert rates == pytest.approx([0.0, 0.95, 1.0, 0.2])
+
+
+@pytest.mark.parametrize(("name", "value"), [("warm_up", -0.1), ("warm_up", 50.0), ("final_rate", float("nan"))])
+def test_what_is_no_share_of_the_budget_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} is {value}: expected a share"):
+        TrainConfig(**{name: value})
 
 
 def test_map_scores_tell_apart_what_was_seen():
@@ -285,7 +297,7 @@ def test_what_is_recorded_can_be_learned_from_and_learning_goes_on_where_it_stop
 @pytest.fixture
 def make(bags):
     small = EstimatorConfig(channels=8, blocks=1), TerminationConfig(channels=8, blocks=1)
-    config = TrainConfig(LearnerConfig(*small, window_frames=8), streams=2, length=4, steps=20, warm_up=1)
+    config = TrainConfig(LearnerConfig(*small, window_frames=8), streams=2, length=4, steps=20, warm_up=0.0)
 
     def make(path, workers=0, bags=bags):
         return make_trainer(Options((bags,), path, config=config, workers=workers))
