@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mujoban_core.bodies import FIRST_PERSON_CAMERA, get_body
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.grid import CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET, WALL, cell_to_xy, xy_to_cell
+from mujoban_core.grid import AGENT, CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET, WALL, cell_to_xy, xy_to_cell
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_sim.cameras import Cameras
-from mujoban_sim.checks import check_rows, hand_over_torque
+from mujoban_sim.checks import check_places, check_rows, hand_over_torque
 from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
 from mujoban_sim.presets import DEFAULT_WORLD, get_world
 from mujoban_sim.scene import BOX_COORDINATES, SceneCache, settled_positions
@@ -250,18 +250,15 @@ class World(Portable):
             box_position: [M, K, 2] in metres; those of boxes that a level lacks are ignored.
 
         Raises:
-            ValueError: if a shape is wrong, a number is not finite or a row has no episode.
+            ValueError: if a shape is wrong, a number is not finite, a robot or a box is off the grid, or a row has no
+                episode.
         """
         chosen = check_rows(rows, self.batch)
         poses, boxes = np.asarray(pose, np.float64), np.asarray(box_position, np.float64)
-        expected = (len(chosen), 3), (len(chosen), self.max_boxes, 2)
-        if (poses.shape, boxes.shape) != expected:
-            raise ValueError(f"pose and box_position have shapes {poses.shape}, {boxes.shape}: expected {expected}")
-        present = np.arange(self.max_boxes) < self.box_count[chosen, None]
-        if not (np.isfinite(poses).all() and np.isfinite(boxes[present]).all()):
-            raise ValueError("pose or box_position is not finite")
+        check_places(poses, boxes, np.arange(self.max_boxes) < self.box_count[chosen, None], self.body.cell_size)
         if any(self._episodes[row] is None for row in chosen.tolist()):
             raise ValueError("cannot place robots in rows without an episode: call reset first")
+        self._abstract_state[chosen, :, :, AGENT] = 0.0
         self.agent_cell[chosen] = xy_to_cell(poses[:, :2], self.body.cell_size)
         self._write_state(chosen, poses, boxes)
 

@@ -222,6 +222,26 @@ def test_completion_follows_the_instruction_in_force():
     assert abs(world.box_position[0, 0, 0] - cell_to_xy((3, 5))[0]) < 0.1 and world.box_speed[0, 0] < 0.3
 
 
+def test_a_robot_that_is_placed_in_another_cell_is_in_that_one_alone():
+    world = room_world()
+    put(world, cell_to_xy((7, 2)), cell_to_xy(FIRST), cell_to_xy(SECOND))
+    for _ in range(2):
+        assert np.argwhere(world.abstract_state()[0, ..., AGENT]).tolist() == [[7, 2]]
+        rest(world)
+
+
+@pytest.mark.parametrize(
+    ("robot", "box", "named"), [((138.5, 0.0), (0.5, 0.5), "pose"), ((0.5, 0.5), (0.0, -5.6), "box_position")]
+)
+def test_what_is_placed_off_the_grid_is_refused_and_nothing_moves(robot, box, named):
+    world = World(2, max_boxes=2)
+    world.reset([0, 1], [EpisodeSpec(ROOM, 7)] * 2)
+    before = world.abstract_state()
+    with pytest.raises(ValueError, match=f"{named} .* is off the grid: expected x and y within 5.0 m"):
+        put(world, robot, box, cell_to_xy(SECOND))
+    assert np.array_equal(world.abstract_state(), before)
+
+
 def test_truth_and_proprioception_are_copies():
     world = room_world()
     truth, before = world.truth(), world.truth().pose.copy()
