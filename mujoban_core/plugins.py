@@ -9,6 +9,7 @@ without arguments, or to a function `(weights, device) -> Module`. `ROLE.weights
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -62,7 +63,8 @@ def load_module(role: str, source: str = LEARNED, weights: Path | None = None, d
         device: Device of the learned module.
 
     Raises:
-        PluginError: If the role or the class is unknown, or an instance is not of the role's interface.
+        PluginError: If the role or the class is unknown, cannot be made without arguments, or an instance is not of the
+            role's interface.
         ValueError: If weights are missing or damaged.
     """
     return _make(role, _interface(role), source, weights, device)
@@ -95,11 +97,19 @@ def _make(role: str, interface: type[Made], source: str, weights: Path | None, d
     make = _resolve(source) if ":" in source else _load(role, source)
     if not callable(make):
         raise PluginError(f"{source} is a {type(make).__name__}: expected a class or a function that makes a {role}")
-    module = make() if ":" in source or isinstance(make, type) else make(weights, device)
+    plain = ":" in source or isinstance(make, type)
+    module = _without_arguments(role, source, make) if plain else make(weights, device)
     if not isinstance(module, interface):
         expected = f"{interface.__module__}.{interface.__name__}"
         raise PluginError(f"{source} is a {type(module).__name__}, expected as {role} a {expected}")
     return module
+
+
+def _without_arguments(role: str, source: str, make: Callable[[], object]) -> object:
+    try:
+        return make()
+    except TypeError as error:
+        raise PluginError(f"{source}: {error}, expected a {role} that is made without arguments") from error
 
 
 def is_privileged(identity: str) -> bool:
@@ -146,7 +156,7 @@ def _resolve(name: str) -> object:
         raise PluginError(f"{name!r} names no class: expected package.module:Class")
     try:
         return getattr(importlib.import_module(module), attribute)
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         raise PluginError(f"{name!r}: {error}, expected package.module:Class that Python finds") from error
     except AttributeError as error:
         raise PluginError(f"{name!r}: {module} has no {attribute}, expected a class in it") from error
