@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from benchmarks.command import run_benchmark
+from mujoban_core.threads import set_threads
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.boards import BitBoards, abstract_states, bit_boards, state_tensor
@@ -141,7 +142,7 @@ def demonstrations_per_second(options: Options) -> float:
 
 def measure(options: Options) -> dict[str, Any]:
     """Return the figures."""
-    torch.set_num_threads(options.threads)
+    set_threads(options.threads)
     shipped = load(SHIPPED)
     return {
         "decision": {

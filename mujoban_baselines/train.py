@@ -36,6 +36,7 @@ from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_core.program import read_options, run_command
 from mujoban_msgs_py.bags.training import bags_digest
+from mujoban_core.threads import set_threads
 from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.run_directory import RunDirectory
@@ -304,7 +305,7 @@ COMMANDS: dict[str, type[_Command]] = {
 def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
     """Run the command line."""
     command = read_options(COMMANDS, command_line, prog, __doc__)
-    torch.set_num_threads(command.threads)
+    set_threads(command.threads)
     command.trainer().run(limit_seconds=command.seconds)
     return 0
 

@@ -17,8 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import torch
-
 from mujoban_controller import SHIPPED, teacher_weights
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.drivers import Driver
@@ -28,6 +26,7 @@ from mujoban_controller.scripted import scripted_driver
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_file, digest
 from mujoban_core.program import give_report, read_options, run_command
+from mujoban_core.threads import set_threads
 from mujoban_rl.weights import load_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -84,7 +83,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = read_options(Options, command_line, PROG, __doc__)
     check_file("--json", options.json)
-    torch.set_num_threads(options.threads)
+    set_threads(options.threads)
     driver, identity = make_driver(options)
     report = judge(
         driver, OraclePlanner(), episodes=options.episodes, first_seed=options.seed, difficulty=options.difficulty,

@@ -40,6 +40,7 @@ from mujoban_controller.ppo import PPOLearner, PPOTrainingConfig, RolloutSource
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
 from mujoban_controller.product import Validation
 from mujoban_core.program import read_options, run_command
+from mujoban_core.threads import set_threads
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.networks import set_scale
@@ -287,7 +288,7 @@ def make_trainer(options: Options) -> Trainer[Any]:
 def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
     """Run the command."""
     options = read_options(Options, command_line, prog, __doc__)
-    torch.set_num_threads(options.threads)
+    set_threads(options.threads)
     make_trainer(options).run(limit_seconds=options.seconds)
     return 0
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from mujoban_core.files import check_file
 from mujoban_core.interfaces import INSTRUCTION_LIMIT, renew_rows
 from mujoban_core.program import give_report, read_options, run_command
+from mujoban_core.threads import set_threads
 from mujoban_estimator import SHIPPED, SHIPPED_TERMINATION, load, load_termination
 from mujoban_estimator.bag_stream import TOPICS, stretches
 from mujoban_estimator.data import Batch, Batcher, Stretch, choose_windows
@@ -155,7 +156,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = read_options(Options, command_line, PROG, __doc__)
     check_file("--json", options.json)
-    torch.set_num_threads(options.threads)
+    set_threads(options.threads)
     result = evaluate(
         load(options.estimator, options.device), load_termination(options.termination, options.device),
         find_bags(options.bags), max_ticks=options.max_ticks, skip_damaged=options.skip_damaged,

@@ -5,6 +5,7 @@ Shapes: S streams, T ticks of a stretch, K = T / `update_every` frames that the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +29,7 @@ from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_linear
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import load_weights, save_weights
+from mujoban_rl.weights import WeightsError, load_weights, save_weights
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,11 @@ class LearnerConfig:
         for name in ("window_frames", "window_length"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: expected at least 1")
+        for name in ("unseen", "frame", "place", "cells", "slip"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}: expected a finite number from 0 on")
+        if not 0.0 <= self.lost <= 1.0:
+            raise ValueError(f"lost is {self.lost}: expected a share from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -97,6 +103,11 @@ class TrainConfig:
         for name in ("warm_up", "final_rate"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} is {getattr(self, name)}: expected a share from 0 to 1")
+
+
+def _learned_for(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what weights depend on: all but how beta follows from its probability."""
+    return {k: v for k, v in hyperparameters.items() if k not in ("limit", "sample", "threshold")}
 
 
 class EstimatorLearner(Learner[Batch]):
@@ -140,10 +151,15 @@ class EstimatorLearner(Learner[Batch]):
         """Begin with the weights of former modules; the ResNet is the estimator's.
 
         Raises:
-            WeightsError: If a file is missing, damaged or does not fit.
+            WeightsError: If a file is missing or damaged, or of another configuration.
         """
         for name, module in (("termination", self.termination), ("estimator", self.estimator)):
-            module.load_state_dict(load_weights(type(module), folder / f"{name}.safetensors").state_dict())
+            path = folder / f"{name}.safetensors"
+            trained = load_weights(type(module), path)
+            theirs, ours = (_learned_for(m.hyperparameters()) for m in (trained, module))
+            if theirs != ours:
+                raise WeightsError(f"{path}: weights of {theirs}, expected those of {ours}")
+            module.load_state_dict(trained.state_dict())
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> dict[str, float]:
         """Take one gradient step; return the parts of the loss."""

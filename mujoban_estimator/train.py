@@ -17,11 +17,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 
 from mujoban_core.files import digest
 from mujoban_core.program import read_options, run_command
+from mujoban_core.threads import set_threads
 from mujoban_estimator.bag_source import BagSource, Reading
 from mujoban_estimator.bag_stream import TOPICS
 from mujoban_estimator.data import Batch
@@ -72,7 +72,7 @@ def make_trainer(options: Options) -> Trainer[Batch]:
         ValueError: if a bag, the configuration or the run directory is not what is expected.
     """
     config = options.config
-    torch.set_num_threads(options.threads)
+    set_threads(options.threads)
     bags, validation = find_bags(options.bags), find_bags(options.validation)
     worlds = set[str]()
     for path in (*bags, *validation):

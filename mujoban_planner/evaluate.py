@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from mujoban_core.files import check_file, digest
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.program import give_report, read_options, run_command
 from mujoban_core.stats import wilson_interval
+from mujoban_core.threads import set_threads
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import take_levels
@@ -138,7 +138,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command line."""
     options = read_options(Options, command_line, PROG, __doc__)
     check_file("--json", options.json)
-    torch.set_num_threads(options.threads)
+    set_threads(options.threads)
     levels = options.level_batch()
     planner = load(options.weights, options.device)
     result = evaluate(planner, levels, options)

@@ -17,10 +17,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import tyro
 
 from mujoban_core.program import read_options, run_command
+from mujoban_core.threads import set_threads
 from mujoban_planner import load
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore
@@ -194,7 +194,7 @@ def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
         "explorer": ExplorerRun,
     }
     command = read_options(commands, command_line, prog, __doc__)
-    torch.set_num_threads(command.threads)
+    set_threads(command.threads)
     command.main()
     return 0
 

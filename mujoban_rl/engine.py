@@ -149,6 +149,16 @@ class Cadence:
     evaluate_first: bool = False
     """Evaluate also what the run begins with."""
 
+    def __post_init__(self) -> None:
+        """Reject what is no distance between two of a kind."""
+        for verb, count, unit in (
+            ("log", self.log_updates, "updates"),
+            ("publish", self.publish_updates, "updates"),
+            ("evaluate", self.evaluate_samples, "samples"),
+        ):
+            if not count > 0:
+                raise ValueError(f"{verb} every {count} {unit}: expected a positive number")
+
 
 class Trainer(Generic[BatchT]):
     """Drives a learner and a source until the budget is spent, in as many bits as it takes."""

@@ -27,7 +27,9 @@ from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError, BagWriter
 from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag, require_training_seeds
 from mujoban_rl.limits import NaNGuard
+from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.testing import check_refusal, check_resuming
+from mujoban_rl.weights import WeightsError
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
 SEED = TRAIN_SEEDS.start
@@ -234,6 +236,41 @@ def test_the_learning_rate_warms_up_and_falls_over_whichever_budget_there_is(ste
 def test_what_is_no_share_of_the_budget_is_refused(name, value):
     with pytest.raises(ValueError, match=f"{name} is {value}: expected a share"):
         TrainConfig(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [("place", float("nan"), "a finite"), ("cells", -1.0, "a finite"), ("lost", 2.0, "a share")],
+)
+def test_weights_of_losses_must_be_numbers(name, value, expected):
+    with pytest.raises(ValueError, match=f"{name} is {value}: expected {expected}"):
+        LearnerConfig(**{name: value})
+
+
+@pytest.mark.parametrize(
+    "other",
+    [EstimatorConfig(channels=8, blocks=1, belief=8), EstimatorConfig(channels=8, blocks=1, update_every=2)],
+)
+def test_weights_of_another_configuration_are_no_start(other, tmp_path):
+    def learner(estimator, limit=120, out=None):
+        termination = TerminationConfig(channels=8, blocks=1, limit=limit)
+        return EstimatorLearner(TrainConfig(LearnerConfig(estimator, termination)), out=out)
+
+    former = learner(other, out=tmp_path)
+    former.export(RunDirectory(tmp_path / "run", former.training), {})
+    with pytest.raises(WeightsError, match=r"estimator.safetensors: weights of .*, expected those of"):
+        learner(EstimatorConfig(channels=8, blocks=1)).start_from(tmp_path)
+    learner(other, limit=90).start_from(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"), [("--threads", "0 threads: expected"), ("--evaluate-every", "evaluate every 0 samples")]
+)
+def test_options_that_are_0_are_one_line(bags, tmp_path, capsys, option, message):
+    command = ["--bags", str(bags), "--run", str(tmp_path / "run"), option, "0"]
+    assert exit_status("train", lambda: main(command)) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and message in said
 
 
 def test_map_scores_tell_apart_what_was_seen():

@@ -114,7 +114,8 @@ def test_render_shows_the_grid_from_above():
 
 def row_infos(infos, i):
     """The infos of environment i, as a single one would give them."""
-    return {name: infos[name][i] for name in ("seed", "level", "solved", "boxes_on_target") if infos.get(f"_{name}", [False] * (i + 1))[i]}
+    names = {"seed", "level", "solved", "boxes_on_target"} & infos.keys()
+    return {name: infos[name][i] for name in names if infos[f"_{name}"][i]}
 
 
 def test_vectorised_environments_behave_as_single_ones():
