@@ -100,6 +100,13 @@ def check_open(closed: bool) -> None:
         raise ClosedEnvironmentError("the environment is closed: make a new one with gymnasium.make")
 
 
+def check_options(options: dict[str, Any] | None, known: str) -> None:
+    """Raise `ValueError` if a reset has options but the one that it knows."""
+    unknown = sorted((options or {}).keys() - {known})
+    if unknown:
+        raise ValueError(f"unknown options {', '.join(unknown)}: expected {known} or none")
+
+
 class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     """Sokoban in a physical 3D warehouse, seen through the robot's own camera.
 
@@ -209,13 +216,17 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
 
         Raises:
             ClosedEnvironmentError: after `close`, as of `step` and `render`.
+            ValueError: if an option is unknown or the level malformed.
         """
         check_open(self._closed)
+        check_options(options, "level")
         super().reset(seed=seed)
         chosen = draw_seed(self.np_random) if seed is None else seed
         level = (options or {}).get("level")
         if isinstance(level, str):
             level = Level.from_text(level)
+        if not isinstance(level, Level | None):
+            raise ValueError(f"level is a {type(level).__name__}: expected a Level or a level text")
         episode = self._source.episode(chosen) if level is None else EpisodeSpec(level, chosen)
         self.world.reset([0], [episode])
         return self._observe(), {"seed": chosen, "level": episode.level.to_text()}

@@ -21,6 +21,7 @@ from mujoban_sim.env import (
     ObservationSet,
     check_observation_set,
     check_open,
+    check_options,
     check_render_mode,
     draw_seed,
     observation_space,
@@ -101,9 +102,11 @@ class MujobanVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]
             options: ``reset_mask``: bool [B], at least one of them true.
 
         Raises:
-            ValueError: if the number of seeds or the mask's shape is wrong, or nothing is to be reset.
+            ValueError: if an option is unknown, the number of seeds or the mask's shape is wrong, or nothing is to be
+                reset.
         """
         check_open(self.closed)
+        check_options(options, "reset_mask")
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ValueError(f"reset_mask {mask!r}: expected {self.num_envs} booleans, one of them true at least")

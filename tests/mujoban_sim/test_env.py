@@ -12,10 +12,10 @@ from gymnasium.vector import AutoresetMode
 import mujoban_sim  # noqa: F401 - registers the environment
 from mujoban_core.grid import cell_to_xy
 from mujoban_sim.checks import TorqueError
-from mujoban_sim.env import OBSERVATION_SETS, MujobanEnv
+from mujoban_sim.env import OBSERVATION_SETS, MujobanEnv, draw_seed
 from mujoban_sim.vector_env import MujobanVectorEnv
 from mujoban_sokoban.episodes import Episodes
-from mujoban_sokoban.generator import TEST_SEEDS, generate_level
+from mujoban_sokoban.generator import TEST_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, generate_level
 from mujoban_sokoban.levels import Level
 
 CORRIDOR = "######\n#@$ .#\n######\n"
@@ -55,10 +55,31 @@ def test_a_seed_is_an_episode_and_without_one_no_test_level_is_played():
     env = MujobanEnv(observations="state")
     first, _ = env.reset(seed=4)
     drawn = [env.reset()[1]["seed"] for _ in range(3)]
-    assert len(set(drawn)) == 3 and not any(seed in TEST_SEEDS for seed in drawn)
+    assert len(set(drawn)) == 3
     again, _ = env.reset(seed=4)
     assert all(np.array_equal(first[name], again[name]) for name in first)
     assert [env.reset()[1]["seed"] for _ in range(3)] == drawn
+
+
+class Lowest:
+    """A generator that draws the lowest number of each range."""
+
+    def integers(self, low, high):
+        return low
+
+
+def test_seeds_are_drawn_beyond_those_of_validation_and_tests():
+    assert draw_seed(Lowest()) == TRAIN_SEEDS.start > max(VALIDATION_SEEDS[-1], TEST_SEEDS[-1])
+
+
+def test_what_a_reset_does_not_know_is_named():
+    single, vector = MujobanEnv(observations="state"), MujobanVectorEnv(2, observations="state")
+    with pytest.raises(ValueError, match=r"unknown options levl: expected level"):
+        single.reset(options={"levl": CORRIDOR})
+    with pytest.raises(ValueError, match=r"unknown options level: expected reset_mask"):
+        vector.reset(options={"level": CORRIDOR})
+    with pytest.raises(ValueError, match=r"level is a int: expected a Level or a level text"):
+        single.reset(options={"level": 3})
 
 
 def test_solving_terminates_and_the_time_limit_truncates():
