@@ -2,12 +2,14 @@
 
 import signal
 
+import numpy as np
 import pytest
 
 from bringup import cluster
 from bringup import record as recording
 from bringup.command import Choice, Stack
 from bringup.record import Job, MixedEpisodes, Options, _job, record
+from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import ROLES
 from mujoban_core.signals import Interrupted, interruptible
 from mujoban_sim.world import World
@@ -98,3 +100,12 @@ def test_the_randomness_of_modules_follows_from_no_levels_seed(tmp_path):
 
     assert drawn(10_000_000) == drawn(20_000_000)
     assert len({*drawn(10_000_000), *drawn(10_000_000, 1)}) == 4
+
+
+def test_what_a_recording_draws_does_not_follow_from_a_level():
+    episodes = MixedEpisodes(50, 7, list(DIFFICULTIES))
+    drawn = [episodes.difficulty(i) for i in range(50)]
+    for difficulty in DIFFICULTIES:
+        # The random numbers of which levels are generated.
+        streams = [np.random.default_rng([difficulty, seed]) for seed in range(7, 57)]
+        assert drawn != [list(DIFFICULTIES)[int(rng.integers(len(DIFFICULTIES)))] for rng in streams]
