@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from mujoban_core import children
 from mujoban_core.bodies import get_body
-from mujoban_estimator.bag_stream import BagStream
+from mujoban_estimator.bag_stream import BagStream, KeptBags
 from mujoban_estimator.data import Batch, Batcher
 from mujoban_rl.engine import Source, State
 
@@ -64,8 +64,9 @@ class _Batches(IterableDataset[_Item]):
 
     def __iter__(self) -> Iterator[_Item]:
         r = self._reading
+        kept = KeptBags()
         streams = [
-            BagStream(r.bags, r.length, rng, skip_damaged=r.skip_damaged, allow_test_seeds=r.allow_test_seeds)
+            BagStream(r.bags, r.length, rng, kept, skip_damaged=r.skip_damaged, allow_test_seeds=r.allow_test_seeds)
             for rng in np.random.default_rng([r.seed, 0]).spawn(r.streams)
         ]
         batcher = Batcher(streams, r.length, get_body(r.body))

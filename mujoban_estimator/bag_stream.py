@@ -1,4 +1,4 @@
-"""Streams training data from recorded bags with bounded memory (see `mujoban_msgs_py.bags`)."""
+"""Streams training data from recorded bags, which are kept within a bound of memory (see `mujoban_msgs_py.bags`)."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ TOPICS: Final = (
     topics.TRUE_TERMINATION,
 )
 """What training needs of a bag."""
+KEPT_BYTES: Final = 2**31
+"""Most memory that the bags take which a training keeps: some 170,000 ticks, of which each has 12.5 KB."""
 
 
 class _Episode:
@@ -71,6 +73,38 @@ def stretches(
         yield episode.take()
 
 
+class KeptBags:
+    """Stretches of bags that have been read to their end, for the rounds to come: reading costs much."""
+
+    def __init__(self, limit: int = KEPT_BYTES) -> None:
+        """Keep bags, the first that are read, up to so many bytes in all; the others are read again."""
+        self._bags: dict[Path, list[Stretch]] = {}
+        self._free = limit
+
+    def get(self, path: Path) -> list[Stretch] | None:
+        """Return the stretches of a bag that is kept."""
+        return self._bags.get(path)
+
+    def keeping(self, path: Path, reader: Iterator[Stretch]) -> Iterator[Stretch]:
+        """Yield what a reader of a bag yields, and keep it from its end on if there is room."""
+        gathered, size, fits = [], 0, True
+        for stretch in reader:
+            more = sum(values.nbytes for values in stretch if isinstance(values, np.ndarray))
+            fits = fits and more <= self._free
+            # What is being gathered counts, so that streams side by side stay within the limit together.
+            if fits:
+                gathered.append(stretch)
+                size, self._free = size + more, self._free - more
+            else:
+                gathered.clear()
+                size, self._free = 0, self._free + size
+            yield stretch
+        if fits and path not in self._bags:
+            self._bags[path] = gathered
+        else:
+            self._free += size
+
+
 class BagStream(Iterator[Stretch]):
     """The stretches of all bags, one bag after the other in an order that is drawn anew each time, for ever."""
 
@@ -79,14 +113,14 @@ class BagStream(Iterator[Stretch]):
         paths: Sequence[Path],
         length: int,
         rng: np.random.Generator,
-        report: ReadReport | None = None,
+        kept: KeptBags | None = None,
         *,
         skip_damaged: bool = False,
         allow_test_seeds: bool = False,
     ) -> None:
-        """Read stretches of `length` ticks from `paths`; `rng` draws the order."""
+        """Read stretches of `length` ticks from `paths`; `rng` draws the order; streams may share what is `kept`."""
         self._paths, self._length, self._rng = list(paths), length, rng
-        self._report = report or ReadReport()
+        self._kept = KeptBags() if kept is None else kept
         self._skip_damaged, self._allow_test_seeds = skip_damaged, allow_test_seeds
         self._begin_round()
 
@@ -94,7 +128,7 @@ class BagStream(Iterator[Stretch]):
         self._drawn_from = self._rng.bit_generator.state
         self._order = self._rng.permutation(len(self._paths)).tolist()
         self._bag, self._taken = 0, 0
-        self._before = self._report.ticks
+        self._found = False
         self._reader: Iterator[Stretch] | None = None
 
     def __next__(self) -> Stretch:
@@ -105,20 +139,27 @@ class BagStream(Iterator[Stretch]):
         """
         while True:
             if self._bag == len(self._order):
-                if self._report.ticks == self._before:
+                if not self._found:
                     raise BagError(
                         f"none of {len(self._paths)} bags holds an episode from its start: nothing to learn from"
                     )
                 self._begin_round()
             path = self._paths[self._order[self._bag]]
             if self._reader is None:
-                bag = open_training_bag(path, TOPICS, skip_damaged=self._skip_damaged)
-                self._reader = stretches(bag, self._length, self._report, allow_test_seeds=self._allow_test_seeds)
+                self._reader = self._open(path)
             stretch = next(self._reader, None)
             if stretch is not None:
-                self._taken += 1
+                self._found, self._taken = True, self._taken + 1
                 return stretch
             self._bag, self._taken, self._reader = self._bag + 1, 0, None
+
+    def _open(self, path: Path) -> Iterator[Stretch]:
+        kept = self._kept.get(path)
+        if kept is not None:
+            return iter(kept)
+        bag = open_training_bag(path, TOPICS, skip_damaged=self._skip_damaged)
+        reader = stretches(bag, self._length, ReadReport(), allow_test_seeds=self._allow_test_seeds)
+        return self._kept.keeping(path, reader)
 
     def state(self) -> dict[str, Any]:
         """Return where the stream is: JSON values."""

@@ -1,3 +1,5 @@
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,7 @@ from mujoban_core.plugins import ROLES
 from mujoban_core.program import exit_status
 from mujoban_core.sense_plan_act import Decision
 from mujoban_estimator import load, load_termination
-from mujoban_estimator.bag_stream import TOPICS, BagStream, stretches
+from mujoban_estimator.bag_stream import TOPICS, BagStream, KeptBags, stretches
 from mujoban_estimator.data import Batcher, Stretch, choose_windows
 from mujoban_estimator.estimator import EstimatorConfig
 from mujoban_estimator.learner import EstimatorLearner, LearnerConfig, TrainConfig
@@ -150,6 +152,43 @@ def test_episodes_that_are_not_for_training_are_refused(tmp_path, seed, difficul
     with pytest.raises(BagError, match=named):
         next(BagStream(paths, 8, np.random.default_rng(0)))
     assert next(BagStream(paths, 8, np.random.default_rng(0), allow_test_seeds=True)).first
+
+
+def same(ours, theirs):
+    return all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
+
+
+def test_a_bag_is_read_once_while_it_is_kept_and_streams_side_by_side_stay_within_the_limit(bags, tmp_path):
+    shutil.copytree(find_bags([bags])[0], tmp_path / "bag")
+    reader = stretches(open_training_bag(tmp_path / "bag", TOPICS), 8, ReadReport())
+    size = sum(values.nbytes for s in reader for values in s if isinstance(values, np.ndarray))
+
+    def streams(limit):
+        kept = KeptBags(limit)
+        return [BagStream([tmp_path / "bag"], 8, np.random.default_rng(i), kept) for i in range(2)]
+
+    room, tight = streams(size), streams(size - 1)
+    # In turn, so that both gather the bag at once and neither has room for all of it.
+    first = [next(stream) for _ in range(3) for stream in room + tight]
+    again = [next(stream) for _ in range(3) for stream in room + tight]
+    assert all(same(a, b) for a, b in zip(first, again, strict=True))
+    for stream in room:
+        [next(stream) for _ in range(3)]
+    shutil.rmtree(tmp_path / "bag")
+    assert all(same(next(stream), first[0]) for stream in room)
+    for stream in tight:
+        with pytest.raises(BagError):
+            [next(stream) for _ in range(4)]
+
+
+def test_a_stream_goes_on_amid_a_bag_that_was_kept(bags):
+    paths = find_bags([bags])
+    stream = BagStream(paths, 8, np.random.default_rng(0))
+    for _ in range(4):
+        next(stream)
+    resumed = BagStream(paths, 8, np.random.default_rng(5))
+    resumed.restore(stream.state())
+    assert all(same(next(resumed), next(stream)) for _ in range(6))
 
 
 def stretch(ticks, *, first=True, terminated=(), completed=()):
