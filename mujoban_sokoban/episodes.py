@@ -13,7 +13,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_sokoban.generator import generate_level
+from mujoban_sokoban.generator import check_difficulty, check_seed, generate_level
 from mujoban_sokoban.levels import Level, read_levels
 from mujoban_sokoban.rules import apply
 
@@ -54,12 +54,8 @@ class LevelSource:
             ValueError: If the difficulty is unknown or the file is malformed or empty.
             OSError: If it cannot be read.
         """
-        if difficulty not in DIFFICULTIES:
-            raise ValueError(f"unknown difficulty {difficulty!r}: expected one of {', '.join(map(str, DIFFICULTIES))}")
-        levels = () if level_file is None else tuple(read_levels(level_file))
-        if level_file is not None and not levels:
-            raise ValueError(f"level file {level_file} has no level: expected at least one")
-        return cls(difficulty, levels)
+        check_difficulty(difficulty)
+        return cls(difficulty, () if level_file is None else tuple(read_levels(level_file)))
 
     @property
     def max_boxes(self) -> int:
@@ -137,8 +133,7 @@ class Episodes(LazyEpisodes):
             OSError: If it cannot be read.
         """
         self.source = LevelSource.make(difficulty, level_file)
-        if seed < 0:
-            raise ValueError(f"seed {seed} is negative: expected an integer from 0")
+        check_seed(seed)
         if count is not None and count < 1:
             raise ValueError(f"{count} episodes: expected at least 1")
         self.level_file = level_file

@@ -209,9 +209,20 @@ def _generate(
     player[0], player[1] = square // SIDE + 1, square % SIDE + 1
 
 
-def _rng(difficulty: int, seed: int) -> np.random.Generator:
+def check_difficulty(difficulty: int) -> None:
+    """Raise a `ValueError` unless there are levels of this difficulty."""
+    if difficulty not in DIFFICULTIES:
+        raise ValueError(f"unknown difficulty {difficulty!r}: expected one of {', '.join(map(str, DIFFICULTIES))}")
+
+
+def check_seed(seed: int) -> None:
+    """Raise a `ValueError` unless a seed can be that of an episode."""
     if seed < 0:
         raise ValueError(f"seed {seed} is negative: expected an integer from 0")
+
+
+def _rng(difficulty: int, seed: int) -> np.random.Generator:
+    check_seed(seed)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([difficulty, seed])))
 
 
@@ -225,8 +236,7 @@ def generate_batch(difficulty: int, seeds: Iterable[int]) -> LevelBatch:
     Raises:
         ValueError: If the difficulty is unknown or a seed is negative.
     """
-    if difficulty not in DIFFICULTIES:
-        raise ValueError(f"unknown difficulty {difficulty!r}: expected one of {', '.join(map(str, DIFFICULTIES))}")
+    check_difficulty(difficulty)
     size, k_boxes = DIFFICULTIES[difficulty]
     seeds = [operator.index(seed) for seed in seeds]
     batch = LevelBatch(
