@@ -54,20 +54,34 @@ def decode_episodes(snapshot: Snapshot) -> list[EpisodeSpec]:
     ]
 
 
-def check_snapshot(snapshot: Snapshot, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Reject what is not a snapshot with these arrays, and episodes besides.
+def check_snapshot(
+    snapshot: Snapshot, rows: int, arrays: Mapping[str, NDArray[Any]], ranges: Mapping[str, tuple[int, int]]
+) -> None:
+    """Reject what is not a snapshot of so many rows of these arrays, and of episodes besides.
+
+    Args:
+        snapshot: What is to be checked.
+        rows: M.
+        arrays: Those of a world, each [B, ...].
+        ranges: Least and greatest value of those by which kernels, which check nothing, find their way.
 
     Raises:
-        ValueError: if an array is missing, has another shape or is not finite.
+        ValueError: if an array is missing, has another shape or type, is not finite or is out of its range.
     """
-    rows = next(iter(shapes.values()))[:1]
-    for name, shape in {**shapes, _SEED: rows, _LEVEL_SEED: rows}.items():
+    seeds = np.empty(0, np.int64)
+    for name, like in {**arrays, _SEED: seeds, _LEVEL_SEED: seeds}.items():
         if name not in snapshot:
             raise ValueError(f"the snapshot lacks {name}")
-        array = snapshot[name]
-        if array.shape != shape or not np.isfinite(array).all():
-            raise ValueError(f"{name} of the snapshot has shape {array.shape}: expected {shape}, all finite")
-    if _LEVEL not in snapshot or snapshot[_LEVEL].shape[:1] != rows or snapshot[_LEVEL].dtype != np.uint8:
+        array, shape = snapshot[name], (rows, *like.shape[1:])
+        if (array.shape, array.dtype) != (shape, like.dtype) or not np.isfinite(array).all():
+            raise ValueError(
+                f"{name} of the snapshot is {array.dtype} of shape {array.shape}: "
+                f"expected {like.dtype} of {shape}, all finite"
+            )
+    for name, (least, most) in ranges.items():
+        if ((snapshot[name] < least) | (snapshot[name] > most)).any():
+            raise ValueError(f"{name} of the snapshot: expected {least} to {most}")
+    if _LEVEL not in snapshot or snapshot[_LEVEL].shape[:1] != (rows,) or snapshot[_LEVEL].dtype != np.uint8:
         raise ValueError(f"the snapshot lacks {_LEVEL}: expected level texts as bytes")
 
 

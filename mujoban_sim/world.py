@@ -20,7 +20,7 @@ from mujoban_core.grid import AGENT, CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, 
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_sim.cameras import Cameras
 from mujoban_sim.checks import check_places, check_rows, hand_over_torque
-from mujoban_sim.goals import MAX_BOX_SPEED, GoalTracker
+from mujoban_sim.goals import MAX_BOX_SPEED, GoalKind, GoalTracker
 from mujoban_sim.presets import DEFAULT_WORLD, get_world
 from mujoban_sim.scene import BOX_COORDINATES, SceneCache, settled_positions
 from mujoban_sim.snapshots import Portable, Snapshot, check_snapshot, decode_episodes, encode_episodes
@@ -294,7 +294,11 @@ class World(Portable):
                 changed then.
         """
         chosen, dynamic = check_rows(rows, self.batch), self._dynamic()
-        check_snapshot(snapshot, {name: (len(chosen), *array.shape[1:]) for name, array in dynamic.items()})
+        ranges = {
+            "agent_cell": (0, GRID_SIZE - 1), "box_cell": (-1, GRID_SIZE - 1),
+            "goals.kind": (min(GoalKind), max(GoalKind)), "goals.box_index": (0, self.max_boxes - 1),
+        }  # fmt: skip
+        check_snapshot(snapshot, len(chosen), dynamic, ranges)
         self._begin(chosen, decode_episodes(snapshot))
         self._physics.reset(ids=chosen, stage=_STAGE_NONE)
         for name, array in dynamic.items():

@@ -99,6 +99,11 @@ def test_what_is_no_snapshot_of_these_rows_changes_nothing():
     for damage, message in (
         ({"qvel": kept["qvel"] * np.nan}, "qvel"), ({"steps": np.zeros(2, np.int64)}, r"steps.*\(2,\)"),
         ({"episode.level": kept["episode.level"][:, :5]}, "."),
+        ({"steps": kept["steps"].astype(np.int32)}, "steps of the snapshot is int32"),
+        ({"agent_cell": kept["agent_cell"] + 100}, "agent_cell of the snapshot: expected 0 to 9"),
+        ({"box_cell": kept["box_cell"] - 100}, "box_cell of the snapshot: expected -1 to 9"),
+        ({"goals.box_index": kept["goals.box_index"] + 2}, "box_index of the snapshot: expected 0 to 1"),
+        ({"goals.kind": kept["goals.kind"] + 9}, "kind of the snapshot: expected"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             world.restore([0], {**kept, **damage})
