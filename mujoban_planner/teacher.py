@@ -21,7 +21,8 @@ from mujoban_planner.samples import EVERY_INSTRUCTION, Samples, concatenate, unl
 from mujoban_sokoban.bitboard import SIDE, SQUARE_STEP, SQUARES, bit, flood, pushable
 from mujoban_sokoban.levels import LevelBatch
 from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD
-from mujoban_sokoban.solver import ABSENT, Demonstrations, Status, demonstrations, solve_batch
+from mujoban_sokoban.solver import Demonstrations, Status, demonstrations, solve_batch
+from mujoban_sokoban.solver_labels import ABSENT
 
 DISCOUNT: Final = 0.99
 """Discount of the planner's returns, per instruction."""

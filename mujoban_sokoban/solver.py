@@ -24,8 +24,6 @@ from mujoban_sokoban.solver_search import make_workspace
 
 MAX_NODES: Final = 250_000
 """States that a search stores by default; enough for more than 99.9 % of levels of difficulty 5."""
-ABSENT: Final = 255
-"""Cell of an absent box in `Demonstrations.boxes`."""
 
 
 class Status(IntEnum):
@@ -73,7 +71,7 @@ class Demonstrations(NamedTuple):
     player: NDArray[np.uint8]
     """Cell, [S]."""
     boxes: NDArray[np.uint8]
-    """Cells, in the order of the level's boxes, [S, K]; `ABSENT` where the level has fewer."""
+    """Cells, in the order of the level's boxes, [S, K]; `solver_labels.ABSENT` where the level has fewer."""
     optimal: NDArray[np.bool_]
     """Which instructions are right: each that begins a shortest walk to the next push, or is that push, [S, 5]."""
     steps_to_go: NDArray[np.int16]

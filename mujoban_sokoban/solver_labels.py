@@ -5,6 +5,8 @@ Shapes: B levels, K boxes, N = `grid.GRID_SIZE`, S labelled states.
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -27,6 +29,8 @@ from mujoban_sokoban.bitboard import (
 )
 from mujoban_sokoban.solver_search import SOLVED, Workspace, search
 
+ABSENT: Final = 255
+"""Cell of a box that a level lacks."""
 _UNREACHED = 127
 
 
@@ -173,7 +177,7 @@ def label_solution(
         pushes: the solution.
         rng: chooses among shortest walks.
         out_player: cell, row * N + column, [S].
-        out_boxes: cells, [S, K]; 255 for absent.
+        out_boxes: cells, [S, K]; `ABSENT` for those that the level lacks.
         out_optimal: which instructions begin a shortest walk to the next push, or are that push, [S, 5].
         out_to_go: moves from here to the solution, [S]; on entry the first holds the solution's moves.
         out_plan: instruction of the next push out of each cell, 0 for none, [S, N, N].
@@ -202,7 +206,7 @@ def label_solution(
             out_player[s] = (at // SIDE + 1) * size + at % SIDE + 1
             for k in range(len(boxes)):
                 box = square_of[k]
-                out_boxes[s, k] = 255 if box < 0 else (box // SIDE + 1) * size + box % SIDE + 1
+                out_boxes[s, k] = ABSENT if box < 0 else (box // SIDE + 1) * size + box % SIDE + 1
             out_to_go[s] = moves - s
             mask = 1 << direction if at == behind else _optimal_directions(at, free, distance)
             out_optimal[s, 0] = False

@@ -12,7 +12,6 @@ from mujoban_sokoban.generator import generate_batch, generate_level
 from mujoban_sokoban.levels import Level, LevelBatch, stack_levels
 from mujoban_sokoban.rules import apply
 from mujoban_sokoban.solver import (
-    ABSENT,
     Status,
     demonstrations,
     label_states,
@@ -21,6 +20,7 @@ from mujoban_sokoban.solver import (
     solve_level,
     solve_levels,
 )
+from mujoban_sokoban.solver_labels import ABSENT
 
 
 def key(boxes, player):
