@@ -35,8 +35,8 @@ from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_core.program import read_options, run_command
-from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_core.threads import set_threads
+from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.run_directory import RunDirectory
