@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from mujoban_planner.imitation import ImitationLearner, LearnerConfig
 from mujoban_planner.option_checks import check_counts, check_positive, check_shares
@@ -16,7 +17,9 @@ from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfi
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import origin, provenance
+from mujoban_rl.weights import lineage, origin, provenance
+
+_DATA: Final = "ways and verdicts of the planner's own search on generated levels, training seeds, without a solver"
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def expert_iteration(
         "method": "expert-iteration",
         "training": asdict(config),
         "init": origin(config.init),
-        "data": "solutions and verdicts of the planner's own search on generated levels, training seeds; no solver",
+        "data": lineage(_DATA, config.init),
     }
     budget = Budget(cpu_seconds=config.cpu_seconds, updates=config.updates)
     run = RunDirectory(directory, config)

@@ -29,7 +29,7 @@ from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import origin, provenance, save_weights
+from mujoban_rl.weights import lineage, origin, provenance, save_weights
 
 _CLIP = 1.0
 """Largest norm of the gradient."""
@@ -226,7 +226,7 @@ def imitation(
         **provenance(),
         "method": "imitation",
         "training": training,
-        "data": _data(config, bags),
+        "data": lineage(_data(config, bags), config.init),
         "init": origin(config.init),
         "bags": [bag.name for bag in bags],
         "bags_digest": bags_digest(bags),

@@ -13,7 +13,7 @@ from mujoban_planner.option_checks import check_counts
 from mujoban_planner.push_policy import PushPolicy
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Budget
-from mujoban_rl.weights import origin, provenance
+from mujoban_rl.weights import lineage, origin, provenance
 
 
 @dataclass(frozen=True)
@@ -56,5 +56,5 @@ def starting_policy(config: PushRunConfig) -> PushPolicy:
 
 def training_record(method: str, config: PushRunConfig) -> dict[str, Any]:
     """Return what the weights' record says of a run."""
-    data = "own play of generated levels, training seeds; no solver"
+    data = lineage("own play of generated levels, training seeds, without a solver", config.init)
     return {**provenance(), "method": method, "training": asdict(config), "init": origin(config.init), "data": data}

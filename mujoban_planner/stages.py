@@ -21,7 +21,8 @@ from mujoban_rl.limits import TimeLimit
 from mujoban_rl.run_directory import RunDirectory
 
 _PRODUCT: Final = "planner.safetensors"
-_NOTED: Final = ("method", "digest", "samples", "updates", "cpu_seconds", "metrics")
+_COSTS: Final = ("samples", "updates", "cpu_seconds")
+_NOTED: Final = ("method", "digest", *_COSTS, "metrics")
 """What the record of the whole says of each stage."""
 
 
@@ -139,5 +140,7 @@ def _export(directory: Path, folders: Sequence[Path]) -> None:
     told = [{name: record.get(name) for name in _NOTED} for record in records]
     target = directory / _PRODUCT
     shutil.copyfile(folders[-1] / _PRODUCT, target)
-    record = {**records[-1], "method": " then ".join(record["method"] for record in records), "stages": told}
+    cost = {name: sum(record.get(name) or 0 for record in records) for name in _COSTS}
+    method = " then ".join(record["method"] for record in records)
+    record = {**records[-1], **cost, "method": method, "stages": told}
     write_atomically(target.with_suffix(".json"), (json.dumps(record, indent=2) + "\n").encode())

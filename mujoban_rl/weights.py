@@ -62,6 +62,14 @@ def origin(path: str | Path | None) -> str | None:
     return None if path is None else digest(path)
 
 
+def lineage(data: str, start: str | Path | None) -> str:
+    """Return what weights learned from, for their record, with what those that they begin with learned from before."""
+    if start is None:
+        return data
+    before = read_record(Path(start)).get("data", "not stated")
+    return before if data in before else f"{before}; then {data}"
+
+
 def save_weights(
     path: str | Path, module: nn.Module, config: Any, record: Mapping[str, Any]
 ) -> None:

@@ -15,10 +15,13 @@ from mujoban_planner import stages
 from mujoban_planner.push_actor import PlayConfig
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
+from mujoban_planner.push_run import training_record
 from mujoban_planner.stages import StagesConfig, train_stages
+from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence, Trainer
 from mujoban_rl.run_directory import RunError
+from mujoban_rl.weights import save_weights
 
 PLAY = PlayConfig(environments=8, steps=4)
 CONFIG = StagesConfig(("ppo=1", "mpo-pushes=3"), cpu_seconds=8e9, channels=8, blocks=1, seed=3)
@@ -56,6 +59,16 @@ def test_each_stage_begins_with_the_planner_of_the_one_before(tmp_path: Path, st
     assert digest(tmp_path / "planner.safetensors") == digest(second)
     assert record["init"] == digest(first) and record["method"] == "ppo over pushes then mpo over pushes"
     assert [stage["digest"] for stage in record["stages"]] == [digest(first), digest(second)]
+    for cost in ("samples", "updates", "cpu_seconds"):
+        assert record[cost] == sum(stage[cost] for stage in record["stages"]) > max(s[cost] for s in record["stages"])
+
+
+def test_weights_that_a_solver_has_taught_are_not_recorded_as_without_one(tmp_path: Path) -> None:
+    network = NetworkConfig(channels=8, blocks=1).build()
+    taught = tmp_path / "taught.safetensors"
+    save_weights(taught, network, network.config, {"data": "solver demonstrations"})
+    config = PushPPOConfig(channels=8, blocks=1, init=str(taught))
+    assert training_record("ppo over pushes", config)["data"].startswith("solver demonstrations; then own play of")
 
 
 def test_a_run_goes_on_with_the_stage_that_was_stopped(tmp_path: Path, started: list[Any]) -> None:
