@@ -382,9 +382,11 @@ def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capf
     assert run(evaluate, *few, *oracles) == 2
     error = capfd.readouterr().err
     assert "the controller was trained for the body ball: expected weights for ant" in error
-    assert run(run_stack, "--headless", *few, *oracles, "--look-around", 5) == 2
+    assert run(run_stack, "--headless", *few, *oracles) == 2
     error = capfd.readouterr().err.splitlines()[-1]
     assert error.endswith("the controller was trained for the body ball: expected weights for ant, or an oracle")
+    assert run(run_stack, "--headless", *few, *oracles, "--look-around", 5) == 2
+    assert capfd.readouterr().err.splitlines()[-1].endswith("has no action that turns it on the spot; expected 0")
 
 
 def test_levels_that_are_not_for_training_are_recorded_only_when_that_is_asked_for():

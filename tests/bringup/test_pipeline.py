@@ -80,7 +80,7 @@ def test_a_trainer_that_is_stopped_alone_is_not_done(tmp_path):
             if metrics.exists():
                 process.send_signal(signal.SIGTERM)
 
-    with pytest.raises(PipelineError, match=r"stage train ended with 143; .*the same command goes on from there"):
+    with pytest.raises(PipelineError, match=r"(?s)stage train ended with 143; .*the same command goes on from there"):
         run.run(stop_trainer)
     assert product.exists() and not run.done
 
