@@ -10,7 +10,7 @@ Shapes: B robots, N = `grid.GRID_SIZE`, P proprioceptive values, U actuators.
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -90,12 +90,20 @@ class AgentPolicy:
     """An agent in the place of `SensePlanAct`: all that it says of a tick are its torques."""
 
     agent: Agent
+    sees: tuple[str, ...] = field(init=False)
+    """What it sees; what it asks for only later it does not get, as no report would name it."""
+    privileged: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Settle what it sees."""
+        object.__setattr__(self, "sees", tuple(self.agent.sees))
+        object.__setattr__(self, "privileged", self.agent.privileged)
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras whose frames it looks at."""
         views = {"frame": FIRST_PERSON_CAMERA, "top_down": TOP_DOWN_CAMERA}
-        return tuple(camera for name, camera in views.items() if name in self.agent.sees)
+        return tuple(camera for name, camera in views.items() if name in self.sees)
 
     def initial_state(self, seeds: NDArray[np.int64]) -> Memory:
         """Return the state at the start of episodes with the given seeds, [B]."""
@@ -103,7 +111,7 @@ class AgentPolicy:
 
     def step(self, obs: Observation, truth: GroundTruth, state: Memory) -> tuple[Decision, Memory]:
         """Return the decision of a tick, in which no instruction is issued, and the next state."""
-        inputs = agent_input(self.agent.sees, obs, truth if self.agent.privileged else None)
+        inputs = agent_input(self.sees, obs, truth if self.privileged else None)
         torque, state = self.agent.step(inputs, state)
         b = len(torque)
         never, nothing = np.zeros(b, np.bool_), np.zeros(b, np.int64)

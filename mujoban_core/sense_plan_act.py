@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from mujoban_core.interfaces import (
     EstimatorInput,
     GroundTruth,
     Memory,
-    Module,
     Observation,
     Planner,
     PlannerState,
@@ -26,6 +25,9 @@ from mujoban_core.interfaces import (
     TerminationOutput,
     TerminationState,
 )
+
+_SEEING: Final = ("estimator", "termination", "controller")
+"""Roles that look at frames, or at the ground truth in their place; a planner sees estimates alone."""
 
 
 class PolicyState(NamedTuple):
@@ -59,12 +61,17 @@ class SensePlanAct:
     termination: Termination
     planner: Planner
     controller: Controller
+    told: frozenset[str] = field(init=False)
+    """Roles that get the ground truth: who calls itself privileged only later gets none, as no report would name it."""
+
+    def __post_init__(self) -> None:
+        """Settle who gets the ground truth."""
+        object.__setattr__(self, "told", frozenset(role for role in _SEEING if getattr(self, role).privileged))
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras whose frames a module looks at; oracles go by the ground truth."""
-        looking = not all(m.privileged for m in (self.estimator, self.termination, self.controller))
-        return (FIRST_PERSON_CAMERA,) if looking else ()
+        return (FIRST_PERSON_CAMERA,) if self.told < set(_SEEING) else ()
 
     def initial_state(self, seeds: NDArray[np.int64]) -> PolicyState:
         """Return the state at the start of episodes with the given seeds, [B]."""
@@ -79,19 +86,19 @@ class SensePlanAct:
     def step(self, obs: Observation, truth: GroundTruth, state: PolicyState) -> tuple[Decision, PolicyState]:
         """Return the decision of tick t and the next state; `truth` reaches privileged modules only."""
         estimate, estimator_state = self.estimator.step(
-            EstimatorInput(obs.frame, obs.pose, _truth_for(self.estimator, truth)), state.estimator
+            EstimatorInput(obs.frame, obs.pose, self._truth_for("estimator", truth)), state.estimator
         )
         previous = np.where(state.planner.instruction < 0, NO_INSTRUCTION, state.planner.instruction)
         beta, termination_state = self.termination.step(
             TerminationInput(
-                obs.frame, obs.proprio, previous, state.terminated, _truth_for(self.termination, truth)
+                obs.frame, obs.proprio, previous, state.terminated, self._truth_for("termination", truth)
             ),
             state.termination,
         )
         instruction, planner_state = self.planner.step(estimate, beta.terminated, state.planner)
         torque, controller_state = self.controller.step(
             ControllerInput(
-                instruction, obs.frame, obs.proprio, beta.terminated, _truth_for(self.controller, truth)
+                instruction, obs.frame, obs.proprio, beta.terminated, self._truth_for("controller", truth)
             ),
             state.controller,
         )
@@ -101,6 +108,5 @@ class SensePlanAct:
             estimator_state, termination_state, planner_state, controller_state, beta.terminated
         )
 
-
-def _truth_for(module: Module, truth: GroundTruth) -> GroundTruth | None:
-    return truth if module.privileged else None
+    def _truth_for(self, role: str, truth: GroundTruth) -> GroundTruth | None:
+        return truth if role in self.told else None

