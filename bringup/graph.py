@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -56,10 +56,10 @@ class GraphError(ValueError):
     """A node of the graph could not start; it has said why."""
 
 
-def keep_memories(parameters: Parameters, folder: Path) -> None:
-    """Have each node keep in a folder what it needs to go on from where it was, when it is started again."""
+def keep_memories(parameters: Parameters, folders: Mapping[str, Path]) -> None:
+    """Have each node keep in its folder what it needs to go on from where it was, when it is started again."""
     for name, values in parameters.items():
-        values["resume_file"] = str(folder / f"{name}.safetensors")
+        values["resume_file"] = str(folders[name] / f"{name}.safetensors")
 
 
 class InProcess:
@@ -156,11 +156,12 @@ class Processes:
         self._restart_limit = restart_limit
         self.restarts: Counter[str] = Counter()
         self._ends: list[tuple[float, str]] = []
-        self._folder = RunFolder()
-        keep_memories(parameters, self._folder.path)
+        # A folder each: what the simulator is told, such as seeds, lies nowhere near a module's process.
+        self._folders = {name: RunFolder() for name in parameters}
+        keep_memories(parameters, {name: folder.path for name, folder in self._folders.items()})
         parameters["simulator"]["await_monitor"] = True
-        self._parameter_file = self._folder.path / "parameters.yaml"
-        write_parameters(parameters, self._parameter_file)
+        for name, values in parameters.items():
+            write_parameters({name: values}, self._parameter_file(name))
         self._children = {name: self._start(name) for name in parameters}
 
     def __enter__(self) -> Processes:
@@ -208,8 +209,12 @@ class Processes:
         """End all processes."""
         if children.stop(self._children.values()):
             clear_shared_memory()
-        self._folder.remove()
+        for folder in self._folders.values():
+            folder.remove()
+
+    def _parameter_file(self, name: str) -> Path:
+        return self._folders[name].path / "parameters.yaml"
 
     def _start(self, name: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", _KINDS[name].__module__, "--ros-args"]
-        return children.start([*command, "--params-file", str(self._parameter_file)])
+        return children.start([*command, "--params-file", str(self._parameter_file(name))])

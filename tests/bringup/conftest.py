@@ -67,7 +67,7 @@ class Play:
         simulator.setdefault("resend_after", 0.2)
         self.parameters = graph_parameters(stack, episodes, **simulator)
         if memories is not None:
-            keep_memories(self.parameters, memories)
+            keep_memories(self.parameters, dict.fromkeys(self.parameters, memories))
         self.graph = InProcess(self.parameters, ())
         self._open = True
         self.tap = self.graph.add(Tap())

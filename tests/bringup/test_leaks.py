@@ -1,14 +1,18 @@
 """Modules that try to cheat: a plugin for each role that collects whatever it can reach of the truth."""
 
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from mujoban_msgs.msg import EpisodeTruth
 from rich.console import Console
 
 from bringup.command import Choice, Stack
+from bringup.graph import Processes
 from bringup.monitor import Watched
+from bringup.parameters import graph_parameters
 from bringup.results import EpisodeResult, report
 from bringup.rollout import rollout
 from bringup.view import live_view
@@ -110,6 +114,16 @@ def test_in_the_graph_a_cheating_plugin_finds_nothing(cheaters, play_graph):
         assert vars(node.module).keys() <= {"limit", "sample", "threshold", "privileged"}
     public = set(topics.EPISODE.type.get_fields_and_field_types())
     assert public == {"header", "episode", "step", "ended"}
+
+
+def test_the_process_of_a_module_is_not_told_what_the_simulators_is(ros):
+    with Processes(graph_parameters(stack(), Episodes(1, 123, difficulty=1))) as processes:
+        for role in ROLES:
+            # What a plugin finds in its command line leads to this file, and to what lies beside it.
+            path = Path(processes._children[role].args[-1])
+            (told,) = yaml.safe_load(path.read_text()).items()
+            assert told[0] == role and not {"seed", "difficulty", "level_file"} & told[1]["ros__parameters"].keys()
+            assert not [file for file in path.parent.iterdir() if "simulator" in file.name]
 
 
 def test_a_plugin_that_is_told_the_truth_is_named_so_everywhere(cheaters):
