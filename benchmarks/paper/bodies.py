@@ -19,10 +19,12 @@ from mujoban_sim.presets import REFERENCE
 
 _PAPER: Final = {BALL.name: 0.818, ANT.name: 0.737}
 """Success at difficulty 5 (paper A.3)."""
-_CONTROLLERS: Final[dict[str, Path | None]] = {
-    BALL.name: None,
-    ANT.name: ROOT / "mujoban_controller" / "weights" / "teacher_ant.safetensors",
+_WEIGHTS: Final = ROOT / "mujoban_controller" / "weights"
+_CONTROLLERS: Final = {
+    BALL.name: _WEIGHTS / "reference" / "controller_ball.safetensors",
+    ANT.name: _WEIGHTS / "teacher_ant.safetensors",
 }
+"""Both learned in the reference world, in which they are compared."""
 _TITLES: Final = {
     BALL.name: "ball, by its camera",
     ANT.name: "ant, by ground truth (privileged)",
