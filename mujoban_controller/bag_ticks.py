@@ -168,10 +168,12 @@ class BagTicks(Iterator[Fields]):
             teacher: Labels each tick with the torques that it would have applied.
 
         Raises:
-            BagError: If there is no bag at a path, or one lacks a topic.
+            BagError: If there is no bag at a path, or one lacks a topic or names another body or world.
         """
         self._config, self._policy, self._teacher = config, policy, teacher
         bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
+        for bag in bags:
+            _check_about(bag, config)
         self._episodes = EndlessEpisodes(bags, self._read, rng, rows)
         self._memory = Recurrent(*policy.initial_memory(rows))
 
@@ -211,6 +213,13 @@ class BagTicks(Iterator[Fields]):
         """Take over what `state` returned."""
         self._episodes.restore(state.part("episodes"))
         self._memory = Recurrent(*(state.part("memory").tensors[name] for name in MEMORY_FIELDS))
+
+
+def _check_about(bag: Bag, config: GoalTaskConfig) -> None:
+    """Refuse a bag that names another body or world: weights are of one of each."""
+    for what, expected in (("body", config.body), ("world", config.world)):
+        if (found := bag.about.get(what, expected)) != expected:
+            raise BagError(f"{bag.path}: recorded with the {what} {found}, expected {expected} (--task.{what})")
 
 
 def labels(teacher: PrivilegedPolicy, fields: Fields) -> NDArray[np.float32]:

@@ -254,6 +254,14 @@ class _Parts:
         return policy.train()
 
 
+def _data(options: Options) -> str:
+    """Return what weights learn from, for their record."""
+    played = f"generated levels of difficulty {options.config.task.difficulty}, seeds of TRAIN_SEEDS"
+    if not options.bags:
+        return played
+    return "recorded bags" if options.bag_share == 1.0 else f"{played}; recorded bags"
+
+
 def make_trainer(options: Options) -> Trainer[Any]:
     """Make, or resume, a run.
 
@@ -269,7 +277,7 @@ def make_trainer(options: Options) -> Trainer[Any]:
         "teacher": origin(config.teacher),
         "initial": origin(config.initial),
         "critic": origin(config.critic),
-        "data": f"generated levels of difficulty {config.task.difficulty}, seeds of TRAIN_SEEDS",
+        "data": _data(options),
         "world": config.task.world,
         "bags": [bag.name for bag in options.bags],
         "bags_digest": bags_digest(options.bags),

@@ -142,7 +142,8 @@ def test_a_run_learns_from_bags_as_well(recorded, tmp_path):
     trainer = make_trainer(Options(tmp_path, MPO, bags=(recorded[0],), bag_share=0.5, evaluation_episodes=0))
     assert trainer.run()
     assert trainer.progress.samples == 64 and trainer.progress.updates > 2
-    assert json.loads((tmp_path / "controller.json").read_text())["bags"] == [recorded[0].name]
+    record = json.loads((tmp_path / "controller.json").read_text())
+    assert record["bags"] == [recorded[0].name] and record["data"].endswith("; recorded bags")
 
 
 @pytest.fixture(params=["mpo", "distil"])
@@ -190,6 +191,13 @@ def test_a_missing_topic_is_named_in_one_line(recorded, tmp_path, capsys):
     assert exit_status("train", lambda: main(command)) == 2
     said = capsys.readouterr().err
     assert "lacks /torque" in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize(("option", "value"), [("world", "reference"), ("body", "ant")])
+def test_bags_of_another_world_or_body_are_refused(recorded, tmp_path, option, value):
+    config = replace(MPO, task=replace(MPO.task, **{option: value}))
+    with pytest.raises(BagError, match=rf"recorded with the {option} .*, expected {value} \(--task\.{option}\)"):
+        make_trainer(Options(tmp_path, config, bags=(recorded[0],), evaluation_episodes=0))
 
 
 def test_episodes_that_are_kept_for_tests_are_refused(tmp_path):
