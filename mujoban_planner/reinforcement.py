@@ -28,7 +28,7 @@ from mujoban_planner.validation import NetworkConfig, success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Source, State, Trainer
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import provenance, save_weights
+from mujoban_rl.weights import lineage, provenance, save_weights
 
 _PLAYED: Final = "abstract environment on generated levels, training seeds"
 
@@ -156,12 +156,13 @@ def reinforcement(
         source: Source[MPOBatch] = RecordedMoves(config, recorded)
     else:
         source = _played(config, learner.network, actors or ActorOptions(), device, recorded)
+    data = "bags" if isinstance(source, RecordedMoves) else _PLAYED + (" and bags" if bags else "")
     record = {
         **provenance(),
         "method": "mpo",
         "training": asdict(config),
         "init": origin,
-        "data": "bags" if isinstance(source, RecordedMoves) else _PLAYED + (" and bags" if bags else ""),
+        "data": lineage(data, init_path),
         "bags_digest": bags_digest(bags),
     }
     return Trainer(run, learner, source, Budget(), cadence, record=record)

@@ -67,7 +67,7 @@ def lineage(data: str, start: str | Path | None) -> str:
     if start is None:
         return data
     before = read_record(Path(start)).get("data", "not stated")
-    return before if data in before else f"{before}; then {data}"
+    return before if data in before.split("; then ") else f"{before}; then {data}"
 
 
 def save_weights(
