@@ -80,8 +80,20 @@ PURPOSES: Final[dict[str, Purpose]] = {
         {
             "imitation": "supervised, by an optimal solver, also on its own play",
             "expert-iteration": "by its own play and search, without a solver",
+            "mpo": "by reward, over moves, by MPO",
+            "mpo over pushes": "by reward, over pushes, by MPO",
+            "ppo over pushes": "by reward, over pushes, by PPO",
         },
         "planner",
+    ),
+    "Explorer": Purpose(
+        "Scout",
+        "Says where to look before pushing.",
+        "The estimate of the abstract state and the cells that turns have shown. No camera, no ground truth.",
+        f"Trained in a grid model of what a camera sees behind walls. Made for {_GRID_LIMITS}.",
+        "it is asked before each decision, for up to 30 instructions",
+        {"mpo, reward for cells that come into view": "by reward, for cells seen for the first time, by MPO"},
+        "estimator",
     ),
     "VisuomotorController": Purpose(
         "Controller",
@@ -97,6 +109,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "controller",
     ),
 }
+for _network in ("ThinkingPlanner", "RecurrentPlanner"):
+    PURPOSES[_network] = PURPOSES["ResidualPlanner"]
 
 
 class CardError(ValueError):

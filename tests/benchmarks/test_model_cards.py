@@ -8,6 +8,8 @@ import pytest
 
 from benchmarks import model_cards
 from bringup.model_card import PURPOSES, CardError
+from mujoban_planner.explorer import Explorer
+from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
 
 
 def test_the_cards_are_up_to_date():
@@ -47,13 +49,19 @@ def test_the_readme_tells_of_each_module_how_it_learned_and_which_rules_stand_be
             assert told[path.stem] == [purpose.how(record), purpose.beside]
 
 
+@pytest.mark.parametrize("network", [ResidualPlanner, ThinkingPlanner, RecurrentPlanner, Explorer])
+def test_every_network_that_a_trainer_of_planners_makes_has_a_card(network):
+    assert network.__name__ in PURPOSES
+
+
 @pytest.mark.parametrize(
     ("class_name", "record", "how"),
     [
         ("VisuomotorController", {"teacher": "a" * 64, "training": {"stage": "distil"}}, "by a teacher that knows"),
         ("VisuomotorController", {"teacher": "scripted driver", "training": {"stage": "distil"}}, "scripted driver"),
         ("VisuomotorController", {"teacher": None, "training": {"stage": "mpo"}}, "by reward"),
-        ("ResidualPlanner", {"method": "expert-iteration then ppo", "training": {}}, "without a solver; then by ppo"),
+        ("ThinkingPlanner", {"method": "expert-iteration then ppo over pushes"}, "solver; then by reward, over pushes"),
+        ("Explorer", {"method": "mpo, reward for cells that come into view"}, "by reward, for cells seen"),
     ],
 )
 def test_how_weights_learned_is_what_their_own_record_says(class_name, record, how):
