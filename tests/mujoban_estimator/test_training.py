@@ -2,7 +2,6 @@ import shutil
 
 import numpy as np
 import pytest
-import torch
 
 from bringup.command import Choice, Stack
 from bringup.exploration import Disturbance
@@ -21,8 +20,6 @@ from mujoban_estimator.bag_stream import TOPICS, BagStream, KeptBags, stretches
 from mujoban_estimator.data import Batcher, Stretch, choose_windows
 from mujoban_estimator.estimator import EstimatorConfig
 from mujoban_estimator.learner import EstimatorLearner, LearnerConfig, TrainConfig
-from mujoban_estimator.losses import missed_steps
-from mujoban_estimator.metrics import MapScores, TerminationScores
 from mujoban_estimator.termination import TerminationConfig
 from mujoban_estimator.train import Options, main, make_trainer
 from mujoban_msgs_py import topics
@@ -236,12 +233,6 @@ def test_cells_stay_seen_until_the_next_episode():
     assert not (third.seen[:, -1] & first.in_view[:, 0]).all() and third.seen.sum() < second.seen.sum()
 
 
-def test_missed_steps_count_earlier_negatives_under_a_positive_label():
-    completed = torch.tensor([[False, True, True, True, True]])
-    logits = torch.tensor([[-1.0, -1.0, -1.0, 1.0, -1.0]])
-    assert missed_steps(logits, completed).tolist() == [[0.0, 0.0, 1.0, 2.0, 2.0]]
-
-
 def test_a_learner_fits_what_it_sees_again_and_again():
     config = TrainConfig(LearnerConfig(window_frames=16), streams=1, learning_rate=3e-3, warm_up=0.0)
     learner = EstimatorLearner(config)
@@ -310,36 +301,6 @@ def test_options_that_are_0_are_one_line(bags, tmp_path, capsys, option, message
     assert exit_status("train", lambda: main(command)) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and message in said
-
-
-def test_map_scores_tell_apart_what_was_seen():
-    truth = MixedEpisodes(1, SEED, [5])[0].level.abstract_state()[None]
-    blind = truth.copy()
-    row, col = np.argwhere(truth[0, ..., 3])[0]
-    blind[0, row, col, 3] = 0.0
-    seen = np.ones((1, 10, 10), bool)
-    seen[0, row, col] = False
-    scores = MapScores()
-    scores.add(blind, truth, np.zeros_like(seen), seen)
-    report = scores.report()
-    assert report["box_recall_seen_before"] == 1.0 and report["box_recall_never_seen"] == 0.0
-    assert report["boxes_all_right"] == 0.0 and report["wall_accuracy_seen"] == report["agent_accuracy"] == 1.0
-    assert report["wall_calibration_error"] == 0.0
-
-
-@pytest.mark.parametrize(
-    ("detection", "precision", "recall", "delay"), [(5, 1.0, 1.0, 1.0), (3, 0.0, None, None), (None, None, 0.0, None)]
-)
-def test_termination_scores_count_instructions(detection, precision, recall, delay):
-    probability, completed = np.zeros(10, np.float32), np.arange(10) >= 4
-    if detection is not None:
-        probability[detection] = 0.9
-    scores = TerminationScores()
-    scores.add(probability, completed, 0.5)
-    report = scores.report()
-    for name, value in (("precision", precision), ("recall", recall), ("mean_delay", delay)):
-        found = report[f"termination_{name}"]
-        assert found == value or (value is None and np.isnan(found))
 
 
 def test_disturbances_must_be_probabilities():
