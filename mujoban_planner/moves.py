@@ -21,6 +21,7 @@ from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.discrete_mpo import MPOSettings
 from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.training_levels import stream_number
 from mujoban_planner.validation import Shares, difficulty_shares
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
@@ -30,7 +31,6 @@ from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 
 _STATE: Final = (GRID_SIZE, GRID_SIZE, len(CHANNELS))
 _FIRST_STREAM: Final = 600_000
-_STREAMS_PER_SEED: Final = 1000
 _SEEDS_PER_STREAM: Final = 10**12
 
 
@@ -53,10 +53,10 @@ class LevelStream:
         Raises:
             ValueError: If the stream has no training seeds.
         """
-        number = _FIRST_STREAM + _STREAMS_PER_SEED * seed + stream
+        number = _FIRST_STREAM + stream_number(seed, stream)
         self.next_seed = TRAIN_SEEDS.start + number * _SEEDS_PER_STREAM
-        if seed < 0 or not 0 <= stream < _STREAMS_PER_SEED or self.next_seed not in TRAIN_SEEDS:
-            raise ValueError(f"stream {stream} of seed {seed}: expected 0 to {_STREAMS_PER_SEED - 1} of a small seed")
+        if self.next_seed not in TRAIN_SEEDS:
+            raise ValueError(f"stream {stream} of seed {seed}: expected one of a small seed")
         self._rng = np.random.default_rng([seed, 2, stream])
         self._difficulties, shares = np.array(list(mix)), np.array(list(mix.values()))
         self._shares = shares / shares.sum()
@@ -177,8 +177,9 @@ class MoveActor(SequenceActor):
         self._planner = architecture(**network).to(self._device)
         self._planner.lay_out()
         self._levels = LevelStream(difficulty_shares(config.mix), config.seed, stream)
-        generator = torch.Generator().manual_seed(_STREAMS_PER_SEED * config.seed + stream)
-        failures = torch.Generator(self._device).manual_seed(_STREAMS_PER_SEED * config.seed + stream)
+        number = stream_number(config.seed, stream)
+        generator = torch.Generator().manual_seed(number)
+        failures = torch.Generator(self._device).manual_seed(number)
         self._environment = AbstractEnvironment(
             config.environments, device=device, failure_rate=config.failure_rate, generator=failures
         )
