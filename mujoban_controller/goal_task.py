@@ -240,7 +240,7 @@ class GoalTask:
         rows = np.flatnonzero(ended)
         # An instruction that the end of its episode cut short says nothing.
         judged = np.flatnonzero(ended & (completed | failed))
-        outcomes = [self._outcome(b, bool(completed[b] and not failed[b])) for b in judged.tolist()]
+        outcomes = [self._outcome(b, bool(completed[b] and not failed[b]), bool(lying[b])) for b in judged.tolist()]
         self._failures = np.where(failed, self._failures + 1, np.where(ended, 0, self._failures))
         given_up = (self._failures >= config.patience) | (self._without_plan >= _NO_PLAN)
         over = world.done | lying | (ended & ((world.steps >= self._horizon) | given_up))
@@ -308,7 +308,7 @@ class GoalTask:
         pair = np.where(push[:, None], offsets[:, 2:], offsets[:, :2])
         return np.hypot(pair[:, 0], pair[:, 1]) - self.config.tolerance
 
-    def _outcome(self, row: int, completed: bool) -> Outcome:
+    def _outcome(self, row: int, completed: bool, lying: bool) -> Outcome:
         world, goals = self.world, self.world.goals
         kind, index = GoalKind(int(goals.kind[row])), int(goals.box_index[row])
         expected = self._start_boxes[row].copy()
@@ -325,7 +325,7 @@ class GoalTask:
             int(self._noise.elapsed[row]),
             kind == GoalKind.PUSH and bool(across > self.config.tolerance),
             astray,
-            bool(fallen(world)[row]),
+            lying,
         )
 
     def _begin_episodes(self, rows: NDArray[np.int64]) -> None:
