@@ -6,10 +6,11 @@ Shapes: S streams, T ticks of a stretch, K = T / `update_every` frames that the 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from mujoban_estimator.odometry import Track
 from mujoban_estimator.termination import ControlTermination, TerminationConfig, true_phases
 from mujoban_rl.engine import Learner, State
 from mujoban_rl.limits import NaNGuard
-from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_linear
+from mujoban_rl.optimise import ProgressSchedule, step_if_finite, warm_up_linear
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import WeightsError, load_weights, save_weights
@@ -80,6 +81,8 @@ class TrainConfig:
     """Bags that are read side by side; each is a row of the batch, whose memory goes on from step to step."""
     length: int = 64
     """Ticks of a stretch, a multiple of `update_every`."""
+    shards: int = 1
+    """Parts of a batch whose gradients are computed side by side, each by a thread, and averaged."""
     steps: int = 20_000
     """Most steps of the run."""
     cpu_seconds: float = 1e9
@@ -100,6 +103,8 @@ class TrainConfig:
             raise ValueError(f"length is {self.length}: expected a multiple of update_every, {every}")
         if self.streams < 1 or self.steps < 1:
             raise ValueError(f"{self.streams} streams, {self.steps} steps: expected at least 1")
+        if not 1 <= self.shards <= self.streams:
+            raise ValueError(f"{self.shards} shards of {self.streams} streams: expected 1 to {self.streams}")
         for name in ("warm_up", "final_rate"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} is {getattr(self, name)}: expected a share from 0 to 1")
@@ -108,6 +113,25 @@ class TrainConfig:
 def _learned_for(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
     """Return what weights depend on: all but how beta follows from its probability."""
     return {k: v for k, v in hyperparameters.items() if k not in ("limit", "sample", "threshold")}
+
+
+class _Shard(NamedTuple):
+    """Some streams of a batch, and what is remembered of them before it."""
+
+    batch: Batch
+    windows: Windows
+    belief: Belief
+    track: Track
+
+
+class _Learned(NamedTuple):
+    """What a shard says."""
+
+    loss: Tensor
+    parts: dict[str, Tensor]
+    gradients: tuple[Tensor | None, ...]
+    belief: Belief
+    track: Track
 
 
 class EstimatorLearner(Learner[Batch]):
@@ -131,8 +155,12 @@ class EstimatorLearner(Learner[Batch]):
         self.estimator = StateEstimator(**vars(self.config.estimator)).to(self.device)
         self.termination = ControlTermination(self.estimator.encoder, **vars(self.config.termination)).to(self.device)
         both = {id(p): p for module in self.modules.values() for p in module.parameters()}
-        self.optimiser = torch.optim.Adam(both.values(), config.learning_rate)
+        self._parameters = list(both.values())
+        self.optimiser = torch.optim.Adam(self._parameters, config.learning_rate)
         self._schedule = ProgressSchedule(self.optimiser, warm_up_linear(config.warm_up, config.final_rate))
+        self._threads = ThreadPoolExecutor(
+            config.shards, "shard", torch.set_num_threads, (torch.get_num_threads(),)
+        )  # fmt: skip
         self._validation, self._out = list(validation), out
         self._belief = self.estimator.initial_belief(config.streams)
         self._track = self._lost_track(config.streams)
@@ -164,12 +192,16 @@ class EstimatorLearner(Learner[Batch]):
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> dict[str, float]:
         """Take one gradient step; return the parts of the loss."""
         self._schedule.follow(progress)
-        memory = self._belief, self._track
-        loss, parts = self.loss(batch)
-        if guarded_step(loss, [self.optimiser], guard, clip=self.training.clip) is None:
+        learned = self._learn(batch)
+        loss = torch.stack([one.loss for one in learned]).mean()
+        for parameter, *gradients in zip(self._parameters, *(one.gradients for one in learned), strict=True):
+            parameter.grad = _mean([g for g in gradients if g is not None], len(learned))
+        if step_if_finite(loss, [self.optimiser], guard, clip=self.training.clip) is not None:
             # What a refused batch left in memory would spoil those to come.
-            self._belief, self._track = memory
-        return {f"train/{name}": float(value) for name, value in parts.items()}
+            self._belief = Belief(*(torch.cat(rows) for rows in zip(*(one.belief for one in learned), strict=True)))
+            self._track = Track(*(torch.cat(rows) for rows in zip(*(one.track for one in learned), strict=True)))
+        parts = {name: [one.parts[name].item() for one in learned] for name in learned[0].parts}
+        return {f"train/{name}": float(np.mean(values)) for name, values in [("loss", loss.item()), *parts.items()]}
 
     def state(self) -> State:
         """Return the random state and what the modules remember of each stream."""
@@ -203,13 +235,33 @@ class EstimatorLearner(Learner[Batch]):
         position = torch.from_numpy(error.astype(np.float32)).to(self.device)
         return self.termination.odometry.initial(streams, self.device)._replace(position=position)
 
-    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of a batch and its parts; the batch continues the one before."""
+    def _learn(self, batch: Batch) -> list[_Learned]:
+        """Return loss and gradients of each shard, in their order."""
+        shards = list(self._shards(batch))
+        compute = map if len(shards) == 1 else self._threads.map
+        return list(compute(self._gradients, shards))
+
+    def _shards(self, batch: Batch) -> Iterator[_Shard]:
+        """Divide the streams; all that is drawn by chance is drawn here, so that threads draw nothing."""
+        streams, count = len(batch.valid), self.training.shards
+        belief = renew_rows(self._belief, self.estimator.initial_belief(streams), batch.first)
+        track = renew_rows(self._track, self._lost_track(streams), batch.first)
+        frames = -(-self.config.window_frames // count)
+        for rows in np.array_split(np.arange(streams), count):
+            part = Batch._make(values[rows] for values in batch)
+            windows = choose_windows(part, frames, self.config.window_length, self.rng)
+            yield _Shard(part, windows, Belief(*(b[rows] for b in belief)), Track(*(t[rows] for t in track)))
+
+    def _gradients(self, shard: _Shard) -> _Learned:
+        learned = self._loss(shard)
+        gradients = torch.autograd.grad(learned.loss, self._parameters, allow_unused=True)
+        return learned._replace(loss=learned.loss.detach(), gradients=gradients)
+
+    def _loss(self, shard: _Shard) -> _Learned:
+        """Return the loss of a shard, its parts and what is remembered after it; no gradients yet."""
+        batch, windows = shard.batch, shard.windows
         streams, ticks = batch.valid.shape
-        self._belief = renew_rows(self._belief, self.estimator.initial_belief(streams), batch.first)
-        self._track = renew_rows(self._track, self._lost_track(streams), batch.first)
         updates = np.arange(0, ticks, self.config.estimator.update_every)
-        windows = choose_windows(batch, self.config.window_frames, self.config.window_length, self.rng)
         seen = (np.arange(streams)[:, None] * ticks + updates).ravel()
         felt = (windows.stream[:, None] * ticks + windows.tick).ravel()
         # Frames that both look at are encoded once.
@@ -217,39 +269,45 @@ class EstimatorLearner(Learner[Batch]):
         with autocast(self.device):
             encoded = self.estimator.encoder(self._tensor(batch.frame.reshape(-1, *batch.frame.shape[2:])[frames]))
             features = encoded[torch.from_numpy(place).to(self.device)]
-            mapped, parts = self._estimator_loss(features[: len(seen)], batch, updates)
-            ended, more = self._termination_loss(features[len(seen) :], batch, windows)
-        return self.config.cells * mapped + ended, {**parts, **more}
+            mapped, parts, belief = self._estimator_loss(features[: len(seen)], shard, updates)
+            ended, more, track = self._termination_loss(features[len(seen) :], shard)
+        return _Learned(self.config.cells * mapped + ended, {**parts, **more}, (), belief, track)
 
     def _estimator_loss(
-        self, features: Tensor, batch: Batch, updates: NDArray[np.int64]
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        streams = len(batch.valid)
-        output = self.estimator(features.unflatten(0, (streams, -1)), batch.pose[:, updates], self._belief)
+        self, features: Tensor, shard: _Shard, updates: NDArray[np.int64]
+    ) -> tuple[Tensor, dict[str, Tensor], Belief]:
+        batch = shard.batch
+        output = self.estimator(features.unflatten(0, (len(batch.valid), -1)), batch.pose[:, updates], shard.belief)
         # Truncated back-propagation through time: the belief goes on, its gradient does not.
         # In the layout that a checkpoint restores, by which convolutions choose their order of additions.
-        self._belief = Belief(*(b.detach().contiguous() for b in output.belief))
+        belief = Belief(*(b.detach().contiguous() for b in output.belief))
         views = Views(self._tensor(batch.in_view[:, updates]), self._tensor(batch.seen[:, updates]))
-        return estimator_loss(
+        loss, parts = estimator_loss(
             output, self._tensor(batch.abstract_state[:, updates]), views,
             self._tensor(batch.valid[:, updates]).float(), unseen=self.config.unseen, frame=self.config.frame,
         )  # fmt: skip
+        return loss, parts, belief
 
-    def _termination_loss(
-        self, features: Tensor, batch: Batch, windows: Windows
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def _termination_loss(self, features: Tensor, shard: _Shard) -> tuple[Tensor, dict[str, Tensor], Track]:
+        batch, windows = shard.batch, shard.windows
         instruction, proprio = self._tensor(batch.instruction), self._tensor(batch.proprio)
         terminated = self._tensor(batch.terminated)
-        progress, self._track = self.termination.odometry(proprio, instruction, terminated, self._track)
+        progress, track = self.termination.odometry(proprio, instruction, terminated, shard.track)
         at = (windows.stream[:, None], windows.tick)
         hidden, cell = self.termination.initial_recurrence(len(windows.stream))
         output = self.termination(features.unflatten(0, windows.tick.shape), progress[at], proprio[at], hidden, cell)
         direction = self._tensor(OFFSETS_XY[batch.instruction[at]].astype(np.float32))
         phases = true_phases(self._tensor(batch.pose[at]), direction, self.termination.odometry.cell_size)
-        return termination_loss(
+        loss, parts = termination_loss(
             output.logits, output.phases, self._tensor(batch.completed[at]), phases,
             self._tensor(windows.valid).float(), place=self.config.place,
         )  # fmt: skip
+        return loss, parts, track
 
     def _tensor(self, values: NDArray) -> Tensor:
         return torch.from_numpy(values).to(self.device)
+
+
+def _mean(gradients: Sequence[Tensor], count: int) -> Tensor | None:
+    """Return the mean over `count` shards; those that a parameter has no part in count as zeros."""
+    return torch.stack(list(gradients)).sum(dim=0) / count if gradients else None

@@ -43,6 +43,19 @@ def guarded_step(
     for optimiser in optimisers:
         optimiser.zero_grad(set_to_none=True)
     loss.backward()
+    return step_if_finite(loss, optimisers, guard, clip=clip, clipped=clipped, part=part)
+
+
+def step_if_finite(
+    loss: Tensor,
+    optimisers: Sequence[Optimizer],
+    guard: NaNGuard,
+    *,
+    clip: float = math.inf,
+    clipped: Iterable[nn.Parameter] | None = None,
+    part: str = "",
+) -> Tensor | None:
+    """Step all optimisers along the gradients that their parameters have; see `guarded_step`."""
     first = list(clipped) if clipped is not None else _parameters(optimisers[:1])
     known = {id(p) for p in first}
     others = [p.grad for p in _parameters(optimisers) if id(p) not in known and p.grad is not None]

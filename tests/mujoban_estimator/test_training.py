@@ -17,7 +17,7 @@ from mujoban_core.program import exit_status
 from mujoban_core.sense_plan_act import Decision
 from mujoban_estimator import load, load_termination
 from mujoban_estimator.bag_stream import TOPICS, BagStream, KeptBags, stretches
-from mujoban_estimator.data import Batcher, Stretch, choose_windows
+from mujoban_estimator.data import Batch, Batcher, Stretch, choose_windows
 from mujoban_estimator.estimator import EstimatorConfig
 from mujoban_estimator.learner import EstimatorLearner, LearnerConfig, TrainConfig
 from mujoban_estimator.termination import TerminationConfig
@@ -237,10 +237,29 @@ def test_a_learner_fits_what_it_sees_again_and_again():
     config = TrainConfig(LearnerConfig(window_frames=16), streams=1, learning_rate=3e-3, warm_up=0.0)
     learner = EstimatorLearner(config)
     batch = next(Batcher([iter([stretch(16, terminated=(8,), completed=(7, 14, 15))])], 16, BALL))
-    before = learner.loss(batch)[0].item()
-    for _ in range(30):
-        learner.update(batch, 0.0, NaNGuard())
-    assert learner.loss(batch)[0].item() < 0.6 * before
+    losses = [learner.update(batch, 0.0, NaNGuard())["train/loss"] for _ in range(31)]
+    assert losses[-1] < 0.6 * losses[0]
+
+
+def test_shards_learn_what_the_whole_batch_teaches():
+    """Equal streams in two shards give the gradient of one shard, and remember every stream in its row."""
+    one = stretch(16, terminated=(8,), completed=(7, 14, 15))
+    batches = [Batch._make(np.concatenate([a] * n) for a in next(Batcher([iter([one])], 16, BALL))) for n in (1, 2)]
+    learners = [
+        EstimatorLearner(
+            TrainConfig(LearnerConfig(window_frames=16 * n, slip=0.0, lost=0.0), streams=n, shards=n, warm_up=0.0)
+        )
+        for n in (1, 2)
+    ]
+    losses = [
+        [learner.update(batch, 0.0, NaNGuard())["train/loss"] for _ in range(3)]
+        for learner, batch in zip(learners, batches, strict=True)
+    ]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+    whole, divided = (learner.state().tensors["belief.hidden"] for learner in learners)
+    assert divided.shape[0] == 2
+    for row in divided:
+        np.testing.assert_allclose(row, whole[0], atol=1e-4)
 
 
 def test_estimator_and_termination_must_share_the_resnet():
