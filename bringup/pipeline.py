@@ -1,19 +1,20 @@
 """Run stages, each a command of its own, in the order in which they need each other; stop and go on at any point.
 
 What is done stands in `pipeline.json` of the run's directory: for every stage its command, the digests of what it
-came from and of what it made, and the time it took. A stage that was stopped is started again with the same command:
-every trainer of this project resumes from its directory.
+came from and of what it made, and the time that it took, by the clock and of the processor. A stage that was stopped is
+started again with the same command: every trainer of this project resumes from its directory.
 """
 
 from __future__ import annotations
 
 import fcntl
 import json
+import resource
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -51,6 +52,8 @@ class Stage:
     cores: int = 1
     resumes: bool = True
     """Whether the command goes on where it was stopped; if not, what it had made is removed before it starts again."""
+    sources: tuple[Path, ...] = ()
+    """Files or folders from elsewhere that it takes."""
 
 
 @dataclass
@@ -61,8 +64,12 @@ class Entry:
     done: bool = False
     seconds: float = 0.0
     """Wall-clock, of all its starts together."""
+    cpu_seconds: float = 0.0
+    """Of its processes that have ended; what stages that were stopped together used is divided by their wall-clock."""
+    spans: list[list[float]] = field(default_factory=list)
+    """When each start began and ended, in seconds since 1970."""
     inputs: dict[str, str] = field(default_factory=dict)
-    """SHA-256 digests of the products of the stages that it needed."""
+    """SHA-256 digests of the products of the stages that it needed, and of its sources."""
     outputs: dict[str, str] = field(default_factory=dict)
 
 
@@ -92,6 +99,7 @@ class Pipeline:
             known.add(stage.name)
             self._check_command(stage)
         self._running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}
+        self._cpu_seconds = _spent_by_children()
 
     def _check_command(self, stage: Stage) -> None:
         entry = self.entries[stage.name]
@@ -114,6 +122,28 @@ class Pipeline:
     def running(self) -> list[str]:
         """Return the names of the stages that run now."""
         return list(self._running)
+
+    def seconds(self) -> float:
+        """Return the wall-clock in which at least one of the stages that have ended ran."""
+        total, until = 0.0, 0.0
+        for start, end in sorted(span for entry in self.entries.values() for span in entry.spans):
+            total += max(0.0, end - max(start, until))
+            until = max(until, end)
+        return total
+
+    def remaining(self) -> float:
+        """Return the seconds until all is done, if every stage takes as long as is expected of it."""
+        done = {name for name, entry in self.entries.items() if entry.done}
+        left = {s.name: max(0.0, s.seconds - self.elapsed(s.name)) for s in self.stages if s.name not in done}
+        running, total = self.running(), 0.0
+        while left:
+            running += [s.name for s in self._ready(self.entries.keys() - left, running)]
+            first = min(running, key=lambda name: left[name])
+            step = left[first]
+            left = {name: seconds - step * (name in running) for name, seconds in left.items() if name != first}
+            running.remove(first)
+            total += step
+        return total
 
     def run(self, on_tick: Callable[[Pipeline], None] | None = None) -> None:
         """Run what is not done yet.
@@ -139,20 +169,28 @@ class Pipeline:
                 self._stop_all()
 
     def _start_ready(self) -> None:
-        used = sum(s.cores for s in self.stages if s.name in self._running)
+        done = {name for name, entry in self.entries.items() if entry.done}
+        for stage in self._ready(done, self.running()):
+            self._start(stage)
+
+    def _ready(self, done: Collection[str], running: Collection[str]) -> list[Stage]:
+        """Return the stages to start beside those that run, when some are done."""
+        used = sum(s.cores for s in self.stages if s.name in running)
+        ready = []
         for stage in self.stages:
-            entry = self.entries[stage.name]
-            if entry.done or stage.name in self._running or not all(self.entries[n].done for n in stage.needs):
+            if stage.name in done or stage.name in running or not all(need in done for need in stage.needs):
                 continue
             if used and used + stage.cores > self.cores:
                 continue
-            self._start(stage)
+            ready.append(stage)
             used += stage.cores
+        return ready
 
     def _start(self, stage: Stage) -> None:
         entry = self.entries[stage.name]
         entry.command = list(stage.command)
         entry.inputs = {k: v for need in stage.needs for k, v in self.entries[need].outputs.items()}
+        entry.inputs |= {_name(p, self.directory): digest(p) for p in stage.sources}
         self._save()
         if not stage.resumes:
             _remove(stage.products)
@@ -171,7 +209,7 @@ class Pipeline:
             code = self._running[stage.name][0].poll()
             if code is None:
                 continue
-            self._finish(stage.name)
+            self._finish([stage.name])
             if code != 0:
                 log = self._log(stage.name)
                 tail = log.read_text(errors="replace")[-_TAIL:]
@@ -183,15 +221,23 @@ class Pipeline:
             entry.done = True
             self._save()
 
-    def _finish(self, name: str) -> None:
-        self.entries[name].seconds = self.elapsed(name)
-        del self._running[name]
+    def _finish(self, names: Sequence[str]) -> None:
+        """Count the time of stages whose processes have just ended."""
+        now, spent = time.time(), _spent_by_children()
+        bits = {name: self.elapsed(name) - self.entries[name].seconds for name in names}
+        for name, seconds in bits.items():
+            entry = self.entries[name]
+            entry.seconds += seconds
+            entry.cpu_seconds += (spent - self._cpu_seconds) * seconds / sum(bits.values())
+            entry.spans.append([now - seconds, now])
+            del self._running[name]
+        self._cpu_seconds = spent
         self._save()
 
     def _stop_all(self) -> None:
-        children.stop([process for process, _ in self._running.values()], _GRACE)
-        for name in self.running():
-            self._finish(name)
+        if self._running:
+            children.stop([process for process, _ in self._running.values()], _GRACE)
+            self._finish(self.running())
 
     def _log(self, name: str) -> Path:
         return self.directory / "logs" / f"{name}.txt"
@@ -200,6 +246,12 @@ class Pipeline:
         self.directory.mkdir(parents=True, exist_ok=True)
         content: Mapping[str, Any] = {name: asdict(entry) for name, entry in self.entries.items() if entry.command}
         write_atomically(self._file, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def _spent_by_children() -> float:
+    """Return the CPU seconds of all processes that this one, or one of those, has started and waited for."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _stored(file: Path) -> dict[str, Entry]:

@@ -49,6 +49,48 @@ def test_the_record_holds_the_digests_of_what_each_stage_came_from(tmp_path):
     assert record["second"]["inputs"] == {"a.txt": digest(tmp_path / "a.txt")} == record["first"]["outputs"]
 
 
+def test_what_comes_from_elsewhere_is_recorded_too(tmp_path):
+    weights = tmp_path / "elsewhere" / "weights"
+    weights.parent.mkdir()
+    weights.write_text("trained before")
+    product = tmp_path / "run" / "x"
+    Pipeline(tmp_path / "run", [Stage("train", write(product, "a"), (product,), sources=(weights,))]).run()
+    entry = json.loads((tmp_path / "run" / "pipeline.json").read_text())["train"]
+    assert entry["inputs"] == {str(weights): digest(weights)}
+
+
+def test_time_is_counted_by_the_clock_and_of_the_processor(tmp_path):
+    """Two stages that run side by side take the time of one by the clock, and of the processor what each used."""
+    busy = "import time\nwhile time.process_time() < {seconds}: pass"
+    names = {"long": 1.0, "short": 0.3}
+    for name in names:
+        (tmp_path / name).touch()
+    found = [Stage(n, ("-c", busy.format(seconds=t)), (tmp_path / n,)) for n, t in names.items()]
+    run = Pipeline(tmp_path, found)
+    run.run()
+    for name, seconds in names.items():
+        assert seconds <= run.entries[name].cpu_seconds < seconds + 0.25
+    assert max(e.seconds for e in run.entries.values()) <= run.seconds() + 1e-6 < sum(
+        e.seconds for e in run.entries.values()
+    )
+    assert Pipeline(tmp_path, found).seconds() == pytest.approx(run.seconds())
+
+
+def test_the_expected_end_follows_from_what_runs_beside_what(tmp_path):
+    def stage(name, seconds, *needs, cores=1):
+        return Stage(name, (), (), needs, seconds, cores)
+
+    found = [stage("a", 10), stage("b", 4), stage("c", 5, "b"), stage("d", 3, "a", "c", cores=2), stage("e", 2, "a")]
+    # a beside b, then c: 10; d wants both cores, so that e waits.
+    assert Pipeline(tmp_path, found).remaining() == 15
+    assert Pipeline(tmp_path / "one", found, cores=1).remaining() == 24
+    done = Pipeline(tmp_path / "done", found)
+    done.entries["a"].done = done.entries["b"].done = True
+    done.entries["c"].seconds = 4.0
+    # One second of c is left, beside e, behind which d must wait.
+    assert done.remaining() == 5
+
+
 def test_a_stopped_run_ends_its_commands_and_goes_on_where_it_was(tmp_path):
     product, starts = tmp_path / "weights", tmp_path / "starts"
     stage = Stage("train", ("-c", TRAINER, str(product), str(starts)), (product,))
