@@ -17,7 +17,8 @@ if __name__ == "__main__":
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -29,6 +30,7 @@ from bringup.options import Count, one_of, whole
 from bringup.pipeline import Pipeline, Stage
 from bringup.training_report import write_report
 from mujoban_core.program import read_options, run_command
+from mujoban_planner.training_levels import LAST_SEED
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 from mujoban_sokoban.generator import FRESH_SEEDS, TRAIN_SEEDS
 
@@ -57,6 +59,7 @@ SHARES: Final = {
     "controller_distil": 0.31,
     "planner": 0.40,
     "bags_first": 0.05,
+    "bags_validation": 0.01,
     "estimator_first": 0.21,
     "controller_mpo": 0.10,
     "planner_views": 0.12,
@@ -65,8 +68,9 @@ SHARES: Final = {
     "evaluation": 0.08,
 }
 """Share of the hours that each stage gets, in their order. Every training has a core: teacher and student beside the
-planner, then the second steps of controller and planner beside the first of the senses. More threads than one bring the
-senses nothing, and cost six times as much where they must share a core."""
+planner, then the second steps of controller and planner beside the first of the senses, whose second has all cores, for
+each a shard of the batch. More threads to a shard bring nothing, and cost six times as much where they must share a
+core."""
 _STEPS: Final = 10**12
 """More than any budget of time lets a trainer take."""
 _SAVED: Final = 0.92
@@ -79,14 +83,22 @@ _EVALUATED_STEPS: Final = 500_000
 """Environment steps of the controller's training between two evaluations, which no budget counts."""
 _JUDGED_PER_HOUR: Final = 16
 """Validation levels of each such evaluation, per hour of the whole run; at most 64."""
-_SENSES: Final = ("--streams", "5", "--learner.slip", "0.015", "--learner.lost", "0.05")
-"""Batch of estimator and termination, and how far the odometer is off in training."""
+_SENSES: Final = ("--learner.slip", "0.015", "--learner.lost", "0.05")
+"""How far the odometer is off in training of estimator and termination."""
+_STREAMS_ALONE: Final = 5
+"""Rows of their batch on one core."""
+_STREAMS_EACH: Final = 3
+"""And for each of several."""
 _VIEWS: Final = ("--noise", "0.1", "--hidden", "0.3")
 """Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
-_STREAMS: Final = {"bags_first": 1, "bags_second": 2}
+_LEVELS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
-_LAST_SEED: Final = 2**31 - 1
-"""The largest of a run: NumPy and torch take it, and every recording's levels are among those for training."""
+_VALIDATION_BAGS: Final = 8_000_000
+"""Seed of the first level of the bags on which the senses are judged."""
+_VALIDATION_PER_HOUR: Final = 6
+"""Episodes of them, per hour of the whole run; at most 32."""
+_LAST_SEED: Final = (LAST_SEED - 1) // 2
+"""The largest of a run, of which the planner's two trainings have two seeds."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +147,15 @@ def _from_before(options: Options, option: str, product: str) -> tuple[str, ...]
     return () if options.before is None else (option, str(options.before / PRODUCTS[product]))
 
 
+def _sources(options: Options, *products: str) -> tuple[Path, ...]:
+    """Return what a training takes from the run that is gone on from."""
+    return () if options.before is None else tuple(options.before / PRODUCTS[product] for product in products)
+
+
 def _trainer(
-    options: Options, name: str, command: Sequence[str], product: str, *needs: str, beside: Sequence[str] = ()
-) -> Stage:
+    options: Options, name: str, command: Sequence[str], product: str, *needs: str, beside: Sequence[str] = (),
+    sources: Sequence[Path] = (), cores: int = 1,
+) -> Stage:  # fmt: skip
     """Return a stage that trains for its share of the hours, which no limit of steps cuts short.
 
     Args:
@@ -147,13 +165,15 @@ def _trainer(
         product: Its weights, a path in the run's directory.
         needs: Stages before it.
         beside: What it makes beside its product.
+        sources: What it takes from elsewhere.
+        cores: What it keeps busy.
     """
     seconds = _seconds(options, name)
-    budget = ("--cpu-seconds", str(round(_SAVED * seconds)))
+    budget = ("--cpu-seconds", str(round(_SAVED * seconds * cores)))
     folder = options.run / name
     arguments = ("-m", *command, "--run", str(folder), *budget)
     outputs = tuple(options.run / path for path in (product, *beside))
-    return Stage(name, arguments, outputs, needs, seconds)
+    return Stage(name, arguments, outputs, needs, seconds, cores, sources=tuple(sources))
 
 
 def _controller(options: Options) -> list[Stage]:
@@ -166,10 +186,12 @@ def _controller(options: Options) -> list[Stage]:
         _trainer(
             options, "teacher", (train, "--stage", "teacher", "--algorithm", "mpo", *common,
             *_from_before(options, "--initial", "teacher")), teacher, beside=(_CRITIC,),
+            sources=_sources(options, "teacher"),
         ),
         _trainer(
             options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common,
             *_from_before(options, "--initial", "controller")), student, "teacher",
+            sources=_sources(options, "controller"),
         ),
         _trainer(
             options, "controller_mpo",
@@ -186,32 +208,56 @@ def _planner(options: Options) -> list[Stage]:
     whole = PRODUCTS["whole"]
     views = ("--init", str(options.run / whole), "--learning-rate", "7e-4", *_VIEWS)
     return [
-        _trainer(options, "planner", (*method, *first, *_from_before(options, "--init", "whole")), whole),
+        _trainer(
+            options, "planner", (*method, *first, *_from_before(options, "--init", "whole")), whole,
+            sources=_sources(options, "whole"),
+        ),
         _trainer(options, "planner_views", (*method, *second, *views), WEIGHTS["planner"], "planner"),
-    ]
+    ]  # fmt: skip
 
 
 def _senses(options: Options) -> list[Stage]:
-    found = []
+    validation = _validation(options)
+    found = [validation]
     earlier = [] if options.before is None else [options.before / PRODUCTS[name] for name in _BAGS]
-    bags = [str(folder) for folder in earlier if folder.exists()]
+    earlier = [folder for folder in earlier if folder.exists()]
+    bags = [str(folder) for folder in earlier]
     start = None if options.before is None else (options.before / PRODUCTS["estimator"]).parent
-    needs: list[str] = []
+    sources = [] if start is None else [start, *earlier]
+    needs = [validation.name]
     for round_ in _BAGS:
         recording = f"bags_{round_}"
         found.append(_recording(options, recording))
         bags.append(str(options.run / recording))
         name = f"estimator_{round_}"
         out = options.run / name / "weights"
+        cores = 1 if round_ == "first" else options.cores
+        streams = _STREAMS_ALONE if cores == 1 else _STREAMS_EACH * cores
         command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out)]
+        command += ["--validation", str(validation.products[0]), "--streams", str(streams), "--shards", str(cores)]
         command += ["--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
         if start is not None:
             command += ["--start", str(start)]
         start = out
         needs.append(recording)
-        found.append(_trainer(options, name, command, f"{name}/weights", *needs))
+        found.append(_trainer(options, name, command, f"{name}/weights", *needs, sources=sources, cores=cores))
         needs.append(name)
     return found
+
+
+def _validation(options: Options) -> Stage:
+    """Return a stage that records the bags on which the senses are judged, as the first round but undisturbed."""
+    name = "bags_validation"
+    first, run = _recording(options, "bags_first"), options.run
+    episodes = max(4, min(32, round(_VALIDATION_PER_HOUR * options.hours)))
+    replaced = {"--out": str(run / name), "--episodes": str(episodes), "--seed": str(_VALIDATION_BAGS)}
+    command = list(first.command)
+    for option, value in replaced.items():
+        command[command.index(option) + 1] = value
+    command += ["--allow-test-seeds", "--undisturbed"]
+    return replace(
+        first, name=name, command=tuple(command), products=(run / name,), seconds=_seconds(options, name)
+    )  # fmt: skip
 
 
 def _recording(options: Options, name: str) -> Stage:
@@ -228,14 +274,15 @@ def _recording(options: Options, name: str) -> Stage:
     sense = ("--oracle", "estimator,termination") if first else ()
     modules = tuple(x for role, path in acting.items() for x in (f"--{role}", str(run / path)))
     episodes = max(8, round(_EPISODES_PER_HOUR * options.hours))
-    stream = len(_STREAMS) * options.seed + _STREAMS[name]
+    stream = len(_LEVELS) * options.seed + _LEVELS[name]
     seed = TRAIN_SEEDS.start + stream * 10**9
     command = (
         "-m", "bringup.record", "--out", str(run / name), "--episodes", str(episodes),
         "--seed", str(seed), "--run-seed", str(stream), "--time-limit", str(_RECORDED_STEPS),
         "--processes", str(cores), "--world", options.world, *sense, *modules,
     )  # fmt: skip
-    return Stage(name, command, (run / name,), tuple(needs.values()), _seconds(options, name), cores, resumes=False)
+    seconds = _seconds(options, name)
+    return Stage(name, command, (run / name,), tuple(needs.values()), seconds, cores, resumes=False)
 
 
 def _evaluation(options: Options) -> Stage:
@@ -253,7 +300,10 @@ def _evaluation(options: Options) -> Stage:
 
 
 class Display:
-    """A line a stage: what it has taken of what it may take; a pipe or file is told when each begins and ends."""
+    """A line a stage: what it has taken of what it may take, and when all are expected to be done.
+
+    A pipe or file is told when each begins and ends.
+    """
 
     def __init__(self, pipeline: Pipeline, console: Console) -> None:
         """Show that all stages wait."""
@@ -261,6 +311,7 @@ class Display:
         self.progress = Progress(
             *columns, console=console, refresh_per_second=1, expand=True, disable=not console.is_interactive
         )
+        self._all = self.progress.add_task("all", total=1.0, note="")
         self._tasks: dict[str, TaskID] = {
             s.name: self.progress.add_task(s.name, total=s.seconds, note="waits") for s in pipeline.stages
         }
@@ -268,6 +319,10 @@ class Display:
 
     def update(self, pipeline: Pipeline) -> None:
         """Show how far every stage is."""
+        remaining = pipeline.remaining()
+        ends = f"{datetime.now() + timedelta(seconds=remaining):%a %H:%M}"
+        passed = pipeline.seconds() / (pipeline.seconds() + remaining) if remaining else 1.0
+        self.progress.update(self._all, completed=passed, note=f"expected to end on {ends}")
         for stage in pipeline.stages:
             spent, done = pipeline.elapsed(stage.name), pipeline.entries[stage.name].done
             if done:
@@ -279,7 +334,8 @@ class Display:
             shown = stage.seconds if done else min(spent, stage.seconds)
             self.progress.update(self._tasks[stage.name], completed=shown, note=note)
             if self.progress.disable and state != self._states[stage.name]:
-                self.progress.console.print(f"{stage.name}: {note}", highlight=False, soft_wrap=True)
+                line = f"{stage.name}: {note}; all is expected to end on {ends}"
+                self.progress.console.print(line, highlight=False, soft_wrap=True)
             self._states[stage.name] = state
 
 

@@ -91,10 +91,13 @@ def _score(report: Mapping[str, Any]) -> Score:
 
 
 def _summary(report: Mapping[str, Any] | None, pipeline: Pipeline) -> Iterator[str]:
-    hours = sum(entry.seconds for entry in pipeline.entries.values()) / 3600
+    spent = sum(entry.cpu_seconds for entry in pipeline.entries.values())
     yield "# Weights from nothing"
     yield ""
-    yield f"All stages together took {hours:.2f} hours of wall-clock, some of them side by side."
+    yield (
+        f"All stages together took {pipeline.seconds() / 3600:.2f} hours by the clock, some of them side by side on "
+        f"{pipeline.cores} cores, and {spent / 3600:.2f} hours of the processor."
+    )
     if report is not None:
         low, high = report["success_interval"]
         yield ""
@@ -108,14 +111,16 @@ def _summary(report: Mapping[str, Any] | None, pipeline: Pipeline) -> Iterator[s
 
 def _stages(run: Path, pipeline: Pipeline) -> Iterator[str]:
     yield ""
-    yield "| stage | minutes | samples | updates | last validation |"
-    yield "|---|---|---|---|---|"
+    yield "| stage | minutes | CPU minutes | samples | updates | last validation |"
+    yield "|---|---|---|---|---|---|"
     for stage in pipeline.stages:
         record = _record(run, stage.products)
         metrics = record.get("metrics", {})
         scores = ", ".join(f"{k} {readable(v)}" for k, v in metrics.items() if isinstance(v, (int, float)))
         done = (readable(record[kind]) if kind in record else "" for kind in ("samples", "updates"))
-        cells = (stage.name, readable(pipeline.entries[stage.name].seconds / 60), *done, scores)
+        entry = pipeline.entries[stage.name]
+        minutes = (readable(seconds / 60) for seconds in (entry.seconds, entry.cpu_seconds))
+        cells = (stage.name, *minutes, *done, scores)
         yield f"| {' | '.join(cells)} |"
 
 

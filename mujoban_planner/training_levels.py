@@ -31,6 +31,8 @@ _LATE_SHARE: Final = 0.9
 """Share of the hardest difficulty then; the one below it has the rest."""
 _KEPT_FAILURES: Final = 20_000
 _STREAMS: Final = TRAIN_SEEDS.start + 700_000 * _SEEDS_PER_STREAM
+LAST_SEED: Final = (TRAIN_SEEDS.stop - _STREAMS) // (_STREAMS_PER_SEED * _SEEDS_PER_STREAM) - 1
+"""The largest seed of a run whose every stream has levels."""
 
 
 def stream_number(seed: int, stream: int) -> int:

@@ -17,6 +17,7 @@ from bringup.pipeline import Pipeline
 from bringup.train_all import PRODUCTS, WEIGHTS, Options, stages
 from bringup.training_report import write_report
 from mujoban_core.program import read_options
+from mujoban_planner.training_levels import LAST_SEED, TrainingLevels, stream_number
 from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range
 
 
@@ -91,12 +92,36 @@ def test_the_evaluation_plays_levels_by_which_nothing_is_chosen(tmp_path: Path) 
         ("--cores", "0", "a whole number from 1 on"),
         ("--world", "moon", "one of "),
         ("--seed", "-1", "a whole number from 0 on"),
-        ("--seed", "10000000000", "a whole number from 0 to 2147483647"),
+        ("--seed", "10000000000", "a whole number from 0 to "),
     ],
 )
 def test_bad_options_are_refused_before_anything_runs(option: str, value: str, expected: str) -> None:
     with pytest.raises(ValueError, match=f"{option} .*{value}.* expected {expected}"):
         read_options(Options, [option, value], "train_all")
+
+
+def test_the_largest_seed_has_levels_for_every_training(tmp_path: Path) -> None:
+    seed = (LAST_SEED - 1) // 2
+    for name, command in commands(Options(run=tmp_path, seed=seed)).items():
+        if name.startswith("planner"):
+            stream = stream_number(int(command[command.index("--seed") + 1]), 999)
+            TrainingLevels(stream)
+        elif name in ("bags_first", "bags_second"):
+            first, episodes = (int(command[command.index(option) + 1]) for option in ("--seed", "--episodes"))
+            assert seed_range(first, episodes) == "training"
+    with pytest.raises(ValueError, match=f"expected a whole number from 0 to {seed}"):
+        Options(seed=seed + 1)
+
+
+def test_the_senses_are_judged_on_bags_of_which_they_learn_nothing(tmp_path: Path) -> None:
+    found = commands(Options(run=tmp_path))
+    recorded = found["bags_validation"]
+    first, episodes = (int(recorded[recorded.index(option) + 1]) for option in ("--seed", "--episodes"))
+    assert seed_range(first, episodes) == "validation"
+    for name in ("estimator_first", "estimator_second"):
+        command, folder = found[name], str(tmp_path / "bags_validation")
+        assert command[command.index("--validation") + 1] == folder
+        assert folder not in command[command.index("--bags") : command.index("--out")]
 
 
 def test_continuing_what_is_not_finished_is_refused(tmp_path: Path) -> None:
