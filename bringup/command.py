@@ -27,6 +27,7 @@ from mujoban_core.plugins import (
     load_scout,
     shipped_weights,
 )
+from mujoban_planner.deliberation import Deliberation
 
 if TYPE_CHECKING:
     from mujoban_core.agent import AgentPolicy
@@ -88,8 +89,8 @@ class Stack:
     look_around: int | None = None
     """Ticks of looking around at the start of an episode; None: `LOOK_AROUND_TICKS`, or 0 for the oracle estimator and
     for a body that cannot turn on the spot."""
-    look_ahead: int = 0
-    """Evaluations of the planner's tree search; 0 for none."""
+    deliberation: Deliberation = field(default_factory=Deliberation)
+    """How long the planner thinks."""
     threads: int = 1
     """Threads of the networks in each process."""
 
@@ -111,17 +112,14 @@ class Stack:
 
         Raises:
             ValueError: If a module cannot be loaded or is of another body, `look_around` is negative, or the planner
-                cannot look ahead.
+                cannot think longer.
         """
         from mujoban_core.sense_plan_act import SensePlanAct
 
         modules = {role: choice.load(self.device) for role, choice in self.choices.items()}
         for role, module in modules.items():
             check_body(role, module, self.body)
-        if self.look_ahead:
-            from mujoban_planner.lookahead import look_ahead
-
-            modules["planner"] = look_ahead(modules["planner"], self.look_ahead)
+        modules["planner"] = self.deliberation.prepare(modules["planner"])
         ticks = self.look_around_ticks
         scout = load_scout(self.scout.source, self.scout.weights, self.device) if ticks else None
         body = get_body(self.body)
@@ -133,9 +131,9 @@ class Stack:
         scout = {SCOUT: self.scout.identity()} if self.look_around_ticks else {}
         return {role: choice.identity() for role, choice in self.choices.items()} | scout
 
-    def settings(self) -> dict[str, int]:
+    def settings(self) -> dict[str, int | float]:
         """Return what a report says, beside `identities`, of how the modules play."""
-        return {"look_around": self.look_around_ticks, "look_ahead": self.look_ahead}
+        return {"look_around": self.look_around_ticks, **self.deliberation.settings()}
 
 
 @dataclass(frozen=True)
@@ -169,7 +167,7 @@ class Solo:
             identity += PRIVILEGED
         return {AGENT: identity}
 
-    def settings(self) -> dict[str, int]:
+    def settings(self) -> dict[str, int | float]:
         """Return what a report says, beside `identities`, of how the agent plays: nothing."""
         return {}
 

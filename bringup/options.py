@@ -20,6 +20,7 @@ from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.grid import DIFFICULTIES, FASTEST
 from mujoban_core.plugins import AGENT, LEARNED, ROLES, SCOUT, SCRIPTED
 from mujoban_core.program import say
+from mujoban_planner.deliberation import CERTAINTY, PER_TICK, Deliberation
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 
 if TYPE_CHECKING:
@@ -123,6 +124,12 @@ class ModuleOptions:
 
     look_ahead: Annotated[int, whole("N", 0)] = 0
     """Let the learned planner search ahead by N evaluations of its network as the robot moves; 0 for none."""
+    look_ahead_per_tick: Annotated[int, whole("N")] = PER_TICK
+    """Of them, in one tick."""
+    look_ahead_certainty: float = CERTAINTY
+    """Probability with which all must be as it seems that a plan of the search rests on."""
+    thinking: Annotated[int, whole("K", 0)] = 0
+    """Thinking time of the planner's network in each decision (docs/planner.md); 0 for its own."""
 
     def stack(self, body: str = BALL.name) -> Stack:
         """Return the modules.
@@ -136,7 +143,8 @@ class ModuleOptions:
                 raise ValueError(f"--oracle {role}: expected some of {','.join(ROLES)}")
             choices[role] = oracle(role, body)
         scout = Choice.parse(SCOUT, self.scout)
-        return Stack(choices, self.device, self.look_around, self.look_ahead, self.threads, body, scout)
+        thought = Deliberation(self.thinking, self.look_ahead, self.look_ahead_per_tick, self.look_ahead_certainty)
+        return Stack(choices, self.device, self.look_around, thought, self.threads, body, scout)
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,10 @@ def graph_parameters(stack: Player, episodes: Episodes, *, run: int = 0, **simul
     for role in LOOKING_ROLES:
         parameters[role]["look_around"] = stack.look_around_ticks
     parameters["planner"] |= {
-        "look_ahead": stack.look_ahead,
+        "thinking": stack.deliberation.thinking,
+        "look_ahead": stack.deliberation.look_ahead,
+        "look_ahead_per_tick": stack.deliberation.per_tick,
+        "look_ahead_certainty": stack.deliberation.certainty,
         "scout": stack.scout.source,
         "scout_weights": "" if stack.scout.weights is None else str(stack.scout.weights),
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import torch
@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
 SHIPPED = Path(__file__).parent / "weights" / "planner.safetensors"
 """The weights that ship."""
-MOST_EVALUATIONS: Final = 10_000
-"""Evaluations of a search ahead at most."""
 
 
 def load(

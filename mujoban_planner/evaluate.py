@@ -54,10 +54,8 @@ class Options:
     symmetric views of the residual network; the network's own by default."""
     caution: float | None = None
     """Weight of the verdicts on pushes in a decision; the planner's own by default."""
-    look_ahead: bool = False
-    """Search under the abstract rules, guided by the network."""
-    expansions: int = 400
-    """Network evaluations per search at most."""
+    look_ahead: int = 0
+    """Network evaluations of a search under the abstract rules, at most; 0 for none."""
     weights: Path = SHIPPED
     """Weights with their record."""
     optimal: bool = True
@@ -98,7 +96,7 @@ def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> d
         planner.thinking = options.thinking
     if options.caution is not None:
         planner.caution = options.caution
-    player = LookAheadPlanner(planner, options.expansions) if options.look_ahead else planner
+    player = LookAheadPlanner(planner, options.look_ahead) if options.look_ahead else planner
     start = time.perf_counter()
     # In chunks, so that memory stays small whatever the number of levels.
     parts = np.array_split(np.arange(len(levels.player)), -(-len(levels.player) // _CHUNK))
@@ -125,7 +123,6 @@ def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> d
         "weights": {"planner": digest(options.weights)},
     }
     if isinstance(player, LookAheadPlanner):
-        result["expansions"] = options.expansions
         result["evaluations_per_level"] = player.evaluations / len(moves)
     if options.optimal and solved.any():
         solutions = solve_batch(take_levels(levels, solved))
@@ -148,7 +145,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         print(f"moves over optimal    {result['moves_over_optimal']:.3f}")
     print(f"decisions per second  {result['decisions_per_second']:.0f}")
     if options.look_ahead:
-        print(f"evaluations per level {result['evaluations_per_level']:.1f}  (at most {options.expansions} per search)")
+        print(f"evaluations per level {result['evaluations_per_level']:.1f}  (at most {options.look_ahead} per search)")
     if options.json is not None:
         give_report(result, options.json)
     return 0

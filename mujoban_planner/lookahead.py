@@ -19,20 +19,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mujoban_core.grid import BOX, TARGET, WALL, Instruction
-from mujoban_core.interfaces import Memory, Module, Planner, put_rows, take_rows
-from mujoban_planner import MOST_EVALUATIONS
+from mujoban_core.interfaces import Memory, Planner, put_rows, take_rows
 from mujoban_planner.abstract_env import MOVE_LIMIT, AbstractEnvironment
 from mujoban_planner.boards import BitBoards, likeliest_boards, state_tensor
 from mujoban_planner.decision import PushMeans, VisitCounts, VisitMemory, count_visits, recall, remember, state_keys
+from mujoban_planner.deliberation import CERTAINTY, MOST_EVALUATIONS
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state, split_memory
 from mujoban_planner.search import LoneSearch, advance
 from mujoban_planner.teacher import possible_pushes
 from mujoban_sokoban.bitboard import NONE, SQUARE_STEP, Bits, Int, bit, pushed
 
-PER_TICK: Final = 2
-"""Evaluations in a tick by default: 8 ms of the 50 ms between two ticks."""
-CERTAINTY: Final = 0.9
-"""Probability by default with which all must be as it seems that a plan rests on."""
 _LIKELIER: Final = 0.5
 """Probability above which a wall or a box is taken for one, whatever certainty is asked for."""
 _NO_KEY: Final = -1
@@ -174,19 +170,6 @@ class LookAheadPlanner(Planner):
         before = recall(states[rows], PushMeans(*take_rows(means, rows)))
         chosen, after = self.planner.choose(states[rows], VisitCounts(*take_rows(counts, rows)), before)
         return chosen, PushMeans(*put_rows(means, rows, after))
-
-
-def look_ahead(module: Module, expansions: int) -> Module:
-    """Return a planner that looks ahead while the robot walks; itself for 0.
-
-    Raises:
-        ValueError: If the number is negative, or the module is no learned planner.
-    """
-    if expansions == 0:
-        return module
-    if not isinstance(module, LearnedPlanner):
-        raise ValueError(f"look-ahead with a {type(module).__name__}: expected the learned planner, which guides it")
-    return LookAheadPlanner(module, expansions, per_tick=PER_TICK)
 
 
 def _searching(searches: NDArray[Any]) -> NDArray[np.bool_]:

@@ -22,15 +22,18 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
-from mujoban_planner import MOST_EVALUATIONS
+from mujoban_planner.deliberation import CERTAINTY, MOST_EVALUATIONS, MOST_THINKING, PER_TICK, Deliberation
 
 
 class PlannerNode(ModuleNode[Planner]):
     """Publishes `/instruction` in every tick.
 
     Parameters, beside those of `ModuleNode`:
+        thinking: Thinking time of the network, 0 for its own. Fixed when the node starts.
         look_ahead: Network evaluations of a tree search that looks for a way to the end of the level, spread over the
-            ticks; 0 for none. Fixed when the node starts.
+            ticks; 0 for none. Fixed likewise.
+        look_ahead_per_tick: Of them, in one tick. Fixed likewise.
+        look_ahead_certainty: Probability with which all must be as it seems that a plan rests on. Fixed likewise.
         scout: What says where to look before pushing: scripted, learned or package.module:Class. Fixed likewise.
         scout_weights: Weights file of the learned one; empty means those that ship. Fixed likewise.
     """
@@ -46,20 +49,27 @@ class PlannerNode(ModuleNode[Planner]):
 
     def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Load the module and start listening."""
-        self._look_ahead: int | None = None
+        self._deliberation: Deliberation | None = None
         self._scout: Scout | None = None
         super().__init__(**options)
 
     def prepare(self, module: Module) -> Module:
-        """Let the planner look ahead, if it is to."""
-        if self._look_ahead is None:
-            about = described("evaluations of a search ahead; 0: none", fixed=True, low=0, high=MOST_EVALUATIONS)
-            self._look_ahead = declare(self, "look_ahead", 0, about)
-        if not self._look_ahead:
-            return module
-        from mujoban_planner.lookahead import look_ahead  # imports PyTorch, which not every planner needs
+        """Let the planner think as long as it is to."""
+        if self._deliberation is None:
+            self._deliberation = self._declare_deliberation()
+        return self._deliberation.prepare(module)
 
-        return look_ahead(module, self._look_ahead)
+    def _declare_deliberation(self) -> Deliberation:
+        def number(name: str, default: int, about: str, low: int, high: int) -> int:
+            return declare(self, name, default, described(about, fixed=True, low=low, high=high))
+
+        certain = described("probability of what a plan rests on", fixed=True, low=0.0, high=1.0)
+        return Deliberation(
+            number("thinking", 0, "thinking time of the network; 0: its own", 0, MOST_THINKING),
+            number("look_ahead", 0, "evaluations of a search ahead; 0: none", 0, MOST_EVALUATIONS),
+            number("look_ahead_per_tick", PER_TICK, "evaluations in a tick", 1, MOST_EVALUATIONS),
+            declare(self, "look_ahead_certainty", CERTAINTY, certain),
+        )
 
     @property
     def scout(self) -> Scout:

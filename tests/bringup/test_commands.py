@@ -25,6 +25,7 @@ from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.bags.training import episode_ticks, open_training_bag
 from mujoban_msgs_py.topics import GRAPH_TOPICS
+from mujoban_planner.deliberation import Deliberation
 from mujoban_sim import rendering
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import TRAIN_SEEDS
@@ -85,7 +86,7 @@ def test_a_report_says_what_was_played(tmp_path):
     write_levels(levels, [Level.from_text(UNSOLVABLE)])
     game = {
         "difficulty": 1, "level_file": None, "level_file_sha256": None, "seed": 5_000_007, "time_limit": 3,
-        "body": "ball", "world": "reference", "realtime": 0.0, "look_around": 7, "look_ahead": 0,
+        "body": "ball", "world": "reference", "realtime": 0.0, "look_around": 7, "look_ahead": 0, "thinking": 0,
     }  # fmt: skip
     few = ["--episodes", 1, "--seed", 5_000_007, "--world", "reference", *ALL_ORACLES, "--json", path]
     assert run(evaluate, *few, "--difficulty", 1, "--time-limit", 3, "--look-around", 7) == 0
@@ -93,9 +94,10 @@ def test_a_report_says_what_was_played(tmp_path):
     filed = {"difficulty": None, "level_file": str(levels), "level_file_sha256": digest(levels)}
     assert run(run_stack, "--headless", *few, "--levels", levels, "--time-limit", 3, "--realtime", 9) == 0
     assert json.loads(path.read_text())["played"] == {**game, **filed, "look_around": 0, "realtime": 9.0}
-    searching = Stack(look_ahead=400, body="ant")
+    searching = Stack(deliberation=Deliberation(look_ahead=400, certainty=0.8), body="ant")
     told = played(searching, Episodes(1, 0), EpisodeOptions(body="ant"))
-    assert told["look_ahead"] == 400 and told["look_around"] == 0 and told["time_limit"] == 9600
+    assert told["look_ahead"] == 400 and told["look_ahead_certainty"] == 0.8
+    assert told["look_around"] == 0 and told["time_limit"] == 9600
 
 
 def test_a_summary_on_the_terminal_names_lost_seeds_by_cause(capfd):

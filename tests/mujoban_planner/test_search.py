@@ -7,9 +7,10 @@ import torch
 
 from mujoban_core.grid import Instruction
 from mujoban_core.program import exit_status
-from mujoban_planner import evaluate
+from mujoban_planner import evaluate, load
 from mujoban_planner.boards import abstract_states, bit_boards, take_levels
-from mujoban_planner.lookahead import LookAheadPlanner, look_ahead
+from mujoban_planner.deliberation import Deliberation
+from mujoban_planner.lookahead import LookAheadPlanner
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.planner import split_memory
 from mujoban_planner.play import play
@@ -176,12 +177,25 @@ def test_what_a_plan_has_left_behind_need_not_be_certain(planner):
     assert (after[0] == memory[0]).all()
 
 
-def test_only_the_learned_planner_can_look_ahead(planner):
-    assert look_ahead(planner, 0) is planner
-    with pytest.raises(ValueError, match="expected the learned planner"):
-        look_ahead(LookAheadPlanner(planner), 100)
-    with pytest.raises(ValueError, match="-1 evaluations"):
-        look_ahead(planner, -1)
+def test_only_the_learned_planner_thinks_longer(planner):
+    assert Deliberation().prepare(planner) is planner and planner.thinking == 1
+    searching = Deliberation(look_ahead=100, per_tick=7, certainty=0.8).prepare(planner)
+    assert (searching.expansions, searching.per_tick, searching.certainty) == (100, 7, 0.8)
+    for asked in (Deliberation(look_ahead=100), Deliberation(thinking=2)):
+        with pytest.raises(ValueError, match="LookAheadPlanner: expected a learned planner"):
+            asked.prepare(searching)
+
+
+def test_thinking_time_reaches_the_network():
+    network = load(compiled=False)
+    Deliberation(thinking=3).prepare(network)
+    assert network.thinking == network.views == 3
+
+
+@pytest.mark.parametrize("name", ["thinking", "look_ahead", "per_tick", "certainty"])
+def test_no_thinking_time_out_of_its_range(name):
+    with pytest.raises(ValueError, match=f"{name} is -1: expected "):
+        Deliberation(**{name: -1})
 
 
 def _run(*arguments):
