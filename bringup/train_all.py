@@ -28,7 +28,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from bringup.options import Count, one_of, whole
 from bringup.pipeline import Pipeline, Stage
-from bringup.training_report import write_report
+from bringup.training_report import EVALUATIONS, write_report
 from mujoban_core.program import read_options, run_command
 from mujoban_planner.training_levels import LAST_SEED
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
@@ -66,6 +66,7 @@ SHARES: Final = {
     "bags_second": 0.03,
     "estimator_second": 0.21,
     "evaluation": 0.08,
+    "evaluation_ahead": 0.08,
 }
 """Share of the hours that each stage gets, in their order. Every training has a core: teacher and student beside the
 planner, then the second steps of controller and planner beside the first of the senses, whose second has all cores, for
@@ -133,7 +134,8 @@ class Options:
 
 def stages(options: Options) -> list[Stage]:
     """Return all stages of a run, each after what it needs."""
-    found = [*_controller(options), *_planner(options), *_senses(options), _evaluation(options)]
+    evaluations = (_evaluation(options, name) for name in EVALUATIONS)
+    found = [*_controller(options), *_planner(options), *_senses(options), *evaluations]
     order = list(SHARES)
     return sorted(found, key=lambda stage: order.index(stage.name))
 
@@ -285,18 +287,18 @@ def _recording(options: Options, name: str) -> Stage:
     return Stage(name, command, (run / name,), tuple(needs.values()), seconds, cores, resumes=False)
 
 
-def _evaluation(options: Options) -> Stage:
+def _evaluation(options: Options, name: str) -> Stage:
+    """Return a stage that plays fresh levels with all four modules, as they are or with a search ahead."""
     run = options.run
     weights = tuple(x for role, path in WEIGHTS.items() for x in (f"--{role}", str(run / path)))
+    report = run / f"{name}.json"
     command = (
         "-m", "bringup.evaluate", "--difficulty", "5", "--episodes", str(options.evaluation_episodes),
-        "--seed", str(FRESH_SEEDS.start), "--world", options.world, "--json", str(run / "evaluation.json"),
-        *weights,
+        "--seed", str(FRESH_SEEDS.start), "--world", options.world, "--json", str(report),
+        *weights, *EVALUATIONS[name].options,
     )  # fmt: skip
     needs = ("estimator_second", "planner_views", "controller_mpo")
-    return Stage(
-        "evaluation", command, (run / "evaluation.json",), needs, _seconds(options, "evaluation"), options.cores
-    )
+    return Stage(name, command, (report,), needs, _seconds(options, name))
 
 
 class Display:

@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import matplotlib
 
@@ -20,13 +20,28 @@ from mujoban_core.text import readable
 from mujoban_sokoban.generator import FRESH_SEEDS
 
 _PREFIX = "evaluation/"
+
+
+class Evaluation(NamedTuple):
+    """How all four modules play together at the end of a run."""
+
+    title: str
+    options: tuple[str, ...] = ()
+
+
+EVALUATIONS: Final = {
+    "evaluation": Evaluation("all four modules"),
+    "evaluation_ahead": Evaluation("with a search ahead of 400 evaluations", ("--look-ahead", "400")),
+}
+"""By the name of the stage."""
 _PLACE = Place("python -m bringup.train_all", None, "levels for validation by which nothing was chosen")
 
 
 def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> Path:
     """Collect weights and model cards in `weights/`, draw the curves, and write `report.md`; return its path."""
-    evaluation = _evaluation(run)
-    scores = [] if evaluation is None else [_score(evaluation)]
+    found = {name: file for name in EVALUATIONS if (file := run / f"{name}.json").exists()}
+    evaluations = {name: json.loads(file.read_text()) for name, file in found.items()}
+    scores = [_score(name, report) for name, report in evaluations.items()]
     for role, name in weights.items():
         for source in ((run / name), (run / name).with_suffix(".json")):
             target = run / "weights" / f"{role}{source.suffix}"
@@ -35,7 +50,7 @@ def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> P
         text = card(target, f"weights/{role}.safetensors", _PLACE, scores)
         write_atomically(target.with_suffix(".md"), text.encode())
     figure = draw_curves(run, [s.name for s in pipeline.stages], run / "curves.png")
-    lines = [*_summary(evaluation, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
+    lines = [*_summary(evaluations, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
     if figure:
         lines += ["", "![Validation scores against CPU seconds](curves.png)"]
     path = run / "report.md"
@@ -43,7 +58,7 @@ def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> P
     return path
 
 
-def evaluations(metrics: Path) -> dict[str, list[tuple[float, float]]]:
+def read_curves(metrics: Path) -> dict[str, list[tuple[float, float]]]:
     """Return the curves of a run's `metrics.jsonl`: pairs of CPU seconds and score, by the score's name."""
     curves: dict[str, list[tuple[float, float]]] = {}
     for line in metrics.read_text().splitlines():
@@ -76,21 +91,15 @@ def _rates(metrics: Path) -> dict[str, list[tuple[float, float]]]:
     """Return the curves that stay within [0, 1], which are rates."""
     if not metrics.exists():
         return {}
-    return {k: v for k, v in evaluations(metrics).items() if all(0.0 <= y <= 1.0 for _, y in v)}
+    return {k: v for k, v in read_curves(metrics).items() if all(0.0 <= y <= 1.0 for _, y in v)}
 
 
-def _evaluation(run: Path) -> dict[str, Any] | None:
-    """Return the report of the four modules together, if they have been evaluated."""
-    file = run / "evaluation.json"
-    return json.loads(file.read_text()) if file.exists() else None
-
-
-def _score(report: Mapping[str, Any]) -> Score:
+def _score(name: str, report: Mapping[str, Any]) -> Score:
     levels = len(report["episodes"])
-    return Score("all four modules", "none", levels, report["success_rate"], report["success_interval"])
+    return Score(EVALUATIONS[name].title, "none", levels, report["success_rate"], report["success_interval"])
 
 
-def _summary(report: Mapping[str, Any] | None, pipeline: Pipeline) -> Iterator[str]:
+def _summary(evaluations: Mapping[str, Mapping[str, Any]], pipeline: Pipeline) -> Iterator[str]:
     spent = sum(entry.cpu_seconds for entry in pipeline.entries.values())
     yield "# Weights from nothing"
     yield ""
@@ -98,15 +107,21 @@ def _summary(report: Mapping[str, Any] | None, pipeline: Pipeline) -> Iterator[s
         f"All stages together took {pipeline.seconds() / 3600:.2f} hours by the clock, some of them side by side on "
         f"{pipeline.cores} cores, and {spent / 3600:.2f} hours of the processor."
     )
-    if report is not None:
-        low, high = report["success_interval"]
-        yield ""
-        yield (
-            f"The four modules solve **{report['success_rate']:.1%}** of {len(report['episodes'])} validation levels "
-            f"of difficulty 5, seeds from {FRESH_SEEDS.start}, by which no stage chooses what it keeps (95 % interval "
-            f"{low:.1%} to {high:.1%}), mean return {report['mean_return']:.2f}. "
-            f"Failures: {', '.join(f'{v} {k}' for k, v in report['failures'].items()) or 'none'}."
-        )
+    if not evaluations:
+        return
+    yield ""
+    yield (
+        f"Solved of validation levels of difficulty 5, seeds from {FRESH_SEEDS.start}, by which no stage chooses what "
+        "it keeps:"
+    )
+    yield ""
+    yield "| | levels | solved | 95 % interval | mean return | failures |"
+    yield "|---|---|---|---|---|---|"
+    for name, report in evaluations.items():
+        interval = " to ".join(f"{limit:.1%}" for limit in report["success_interval"])
+        failures = ", ".join(f"{v} {k}" for k, v in report["failures"].items()) or "none"
+        rate, mean = f"**{report['success_rate']:.1%}**", f"{report['mean_return']:.2f}"
+        yield f"| {EVALUATIONS[name].title} | {len(report['episodes'])} | {rate} | {interval} | {mean} | {failures} |"
 
 
 def _stages(run: Path, pipeline: Pipeline) -> Iterator[str]:

@@ -62,7 +62,8 @@ def test_an_ant_does_the_same_in_the_graph_as_in_process(play_graph, oracles, an
 
 
 def test_a_planner_that_looks_ahead_while_the_robot_moves_does_the_same(play_graph, oracles):
-    stack = Stack(oracles.choices | {"planner": Choice("planner")}, deliberation=Deliberation(2, look_ahead=30, per_tick=3))
+    thinking = Deliberation(thinking=2, look_ahead=30, per_tick=3)
+    stack = Stack(oracles.choices | {"planner": Choice("planner")}, deliberation=thinking)
     assert_equal_runs(play_graph, stack, Episodes(1, 7, difficulty=1), 60)
 
 

@@ -15,7 +15,7 @@ import mujoban_estimator.train
 import mujoban_planner.train
 from bringup.pipeline import Pipeline
 from bringup.train_all import PRODUCTS, WEIGHTS, Options, stages
-from bringup.training_report import write_report
+from bringup.training_report import EVALUATIONS, write_report
 from mujoban_core.program import read_options
 from mujoban_planner.training_levels import LAST_SEED, TrainingLevels, stream_number
 from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range
@@ -75,8 +75,9 @@ def test_a_run_whose_bags_are_gone_is_continued_with_new_ones_alone(tmp_path: Pa
     assert first[first.index("--bags") + 1 : first.index("--out")] == (str(run / PRODUCTS["first"]),)
 
 
-def test_the_evaluation_plays_levels_by_which_nothing_is_chosen(tmp_path: Path) -> None:
-    command = commands(Options(run=tmp_path))["evaluation"]
+@pytest.mark.parametrize("name", EVALUATIONS)
+def test_an_evaluation_plays_levels_by_which_nothing_is_chosen(tmp_path: Path, name: str) -> None:
+    command = commands(Options(run=tmp_path))[name]
     seed, episodes = (int(command[command.index(option) + 1]) for option in ("--seed", "--episodes"))
     played = range(seed, seed + episodes)
     # Controllers keep what solves most of the first levels for validation, planners of those from 9,000,000 on.
@@ -157,7 +158,8 @@ def test_the_report_stands_beside_weights_with_their_cards(tmp_path: Path) -> No
     (tmp_path / "evaluation.json").write_text(json.dumps(outcome))
     options = Options(run=tmp_path)
     text = write_report(tmp_path, Pipeline(tmp_path, stages(options)), WEIGHTS).read_text()
-    assert "**50.0%** of 2 validation levels of difficulty 5, seeds from 7000000, by which no stage chooses" in text
+    assert "levels of difficulty 5, seeds from 7000000, by which no stage chooses" in text
+    assert "| all four modules | 2 | **50.0%** | 10.0% to 90.0% | 7.00 | none |" in text and "search ahead" not in text
     assert "success_rate/5 0.75" in text
     card = (tmp_path / "weights" / "planner.md").read_text()
     assert "| all four modules | none | 2 | 50.0 % | 10.0 to 90.0 % |" in card and "| success_rate/5 | 0.75 |" in card
