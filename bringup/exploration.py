@@ -4,7 +4,7 @@ Each wraps a module of the policy and passes on what the policy would do, distur
 generator that is passed in. A recording that mixes rows of different disturbance covers boxes pushed astray, overshoot,
 belated and premature termination, and views to all sides.
 
-Shapes: B robots.
+Shapes: B robots with U torques each.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_core.bodies import BALL, Body
 from mujoban_core.grid import AGENT, BOX, TARGET, WALL, Instruction
 from mujoban_core.interfaces import (
     Controller,
@@ -164,43 +165,51 @@ class DisturbedPlanner(Planner):
 class DisturbedController(Controller):
     """Adds slowly varying noise to another controller's torques, and now and then turns on the spot.
 
-    Torques are taken to be (roll, steer), those of the ball body.
+    A body that has no torques for such a turn does not turn.
     """
 
-    def __init__(self, inner: Controller, disturbance: Disturbance, rng: np.random.Generator) -> None:
-        """Wrap a controller."""
+    def __init__(
+        self, inner: Controller, disturbance: Disturbance, rng: np.random.Generator, body: Body = BALL
+    ) -> None:
+        """Wrap a controller of a body, which has U torques."""
         self.privileged = inner.privileged
         self._inner, self._disturbance, self._rng = inner, disturbance, rng
+        turn = np.zeros(body.action_size) if body.turn is None else np.array(body.turn)
+        self._left = turn / max(1e-9, np.abs(turn).max())  # as fast as it can
+        self._turns_at_all = body.turn is not None
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return the inner memory, noise [B, 2], its deviation [B], the turn's torque [B] and ticks left of it [B]."""
+        """Return the inner memory, noise [B, U], its deviation [B], the turn's torque [B] and ticks left of it [B]."""
         d, rng = self._disturbance, self._rng
         deviation = rng.uniform(0.0, d.max_noise, batch) * (rng.random(batch) < d.shaky)
         turn, left = self._turns(batch, d.spin)
-        return (self._inner.initial_memory(batch), np.zeros((batch, 2)), deviation, turn, left)
+        return (self._inner.initial_memory(batch), np.zeros((batch, len(self._left))), deviation, turn, left)
 
     def _turns(self, batch: int, chance: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Draw turns to begin with a given chance: torque and duration in ticks, 0 for none."""
         torque = self._rng.uniform(0.3, 1.0, batch) * self._rng.choice([-1.0, 1.0], batch)
         ticks = self._rng.integers(5, 50, batch)
-        return torque, np.where(self._rng.random(batch) < chance, ticks, 0)
+        drawn = (self._rng.random(batch) < chance) & self._turns_at_all
+        return torque, np.where(drawn, ticks, 0)
 
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
-        """Return disturbed torques, [B, 2], and the next memory."""
+        """Return disturbed torques, [B, U], and the next memory."""
         inner, noise, deviation, turn, left = state
         torque, inner = self._inner.step(inputs, inner)
         noise = _PERSISTENCE * noise + np.sqrt(1 - _PERSISTENCE**2) * self._rng.normal(size=noise.shape)
         again, ticks = self._turns(len(left), self._disturbance.spin_again)
         begin = (left == 0) & (ticks > 0)
         turn, left = np.where(begin, again, turn), np.where(begin, ticks, left)
-        spinning = np.stack([np.zeros_like(turn), turn], axis=-1)
+        spinning = turn[:, None] * self._left
         disturbed = np.where((left > 0)[:, None], spinning, torque + deviation[:, None] * noise)
         left = np.maximum(left - 1, 0)
         return np.clip(disturbed, -1.0, 1.0).astype(np.float32), (inner, noise, deviation, turn, left)
 
 
-def disturbed(policy: SensePlanAct, disturbance: Disturbance, rng: np.random.Generator) -> SensePlanAct:
-    """Return a policy that does what the given one does, disturbed; where it looks around, it goes on to."""
+def disturbed(
+    policy: SensePlanAct, disturbance: Disturbance, rng: np.random.Generator, body: Body = BALL
+) -> SensePlanAct:
+    """Return a body's policy that does what the given one does, disturbed; where it looks around, it goes on to."""
     planner = policy.planner
     if isinstance(planner, LookAroundPlanner):
         planner = planner.for_planner(DisturbedPlanner(planner.inner, disturbance, rng))
@@ -210,5 +219,5 @@ def disturbed(policy: SensePlanAct, disturbance: Disturbance, rng: np.random.Gen
         policy.estimator,
         DisturbedTermination(policy.termination, disturbance, rng),
         planner,
-        DisturbedController(policy.controller, disturbance, rng),
+        DisturbedController(policy.controller, disturbance, rng, body),
     )

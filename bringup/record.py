@@ -32,7 +32,7 @@ from bringup.options import ClusterOptions, Count, ModuleOptions, WorldOptions, 
 from bringup.progress import EpisodesBar
 from bringup.rollout import ticks
 from mujoban_core import children
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import get_body
 from mujoban_core.files import check_folder
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.program import called, read_options, reason, run_command
@@ -132,11 +132,6 @@ class Options:
     physics: Annotated[WorldOptions, arg(name="")] = field(default_factory=WorldOptions)
     modules: Annotated[ModuleOptions, arg(name="")] = field(default_factory=ModuleOptions)
 
-    def __post_init__(self) -> None:
-        """Reject what contradicts itself."""
-        if self.physics.body != BALL.name and not self.undisturbed:
-            raise ValueError(f"--body {self.physics.body}: disturbances roll and steer a ball; expected --undisturbed")
-
     @property
     def parts(self) -> int:
         """Number of processes among which the episodes are shared out."""
@@ -176,7 +171,7 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
     set_threads(job.stack.threads)
     policy: SensePlanAct = job.stack.policy()
     if job.disturbance is not None:
-        policy = disturbed(policy, job.disturbance, np.random.default_rng(job.run_seed))
+        policy = disturbed(policy, job.disturbance, np.random.default_rng(job.run_seed), get_body(job.stack.body))
     world = World(
         min(job.batch, len(job.episodes)), body=job.stack.body, world=job.world, time_limit=job.time_limit,
         threads=job.stack.threads,

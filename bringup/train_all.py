@@ -17,7 +17,7 @@ if __name__ == "__main__":
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Final
@@ -26,12 +26,12 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from bringup.options import Count, one_of, whole
+from bringup.options import Count, WorldOptions, whole
 from bringup.pipeline import Pipeline, Stage
 from bringup.training_report import EVALUATIONS, write_report
+from mujoban_core.bodies import BALL, get_body
 from mujoban_core.program import read_options, run_command
 from mujoban_planner.training_levels import LAST_SEED
-from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
 from mujoban_sokoban.generator import FRESH_SEEDS, TRAIN_SEEDS
 
 PROG = "bringup.train_all"
@@ -79,7 +79,7 @@ _SAVED: Final = 0.92
 _EPISODES_PER_HOUR: Final = 90
 """Recorded in each round, per hour of the whole run."""
 _RECORDED_STEPS: Final = 900
-"""Longest recorded episode."""
+"""Longest recorded episode of the ball; a body that has more time for a level has more here."""
 _EVALUATED_STEPS: Final = 500_000
 """Environment steps of the controller's training between two evaluations, which no budget counts."""
 _JUDGED_PER_HOUR: Final = 16
@@ -113,8 +113,7 @@ class Options:
     before: Annotated[Path | None, tyro.conf.arg(name="continue")] = None
     """Directory of a finished run: every module goes on from its weights, and learns also from its bags, if they are
     still there."""
-    world: Annotated[str, one_of(WORLDS)] = DEFAULT_WORLD
-    """Physical world."""
+    physics: Annotated[WorldOptions, tyro.conf.arg(name="")] = field(default_factory=WorldOptions)
     seed: Annotated[int, whole("N", 0)] = 0
     cores: Count = 2
     evaluation_episodes: Count = 128
@@ -142,6 +141,10 @@ def stages(options: Options) -> list[Stage]:
 
 def _seconds(options: Options, name: str) -> float:
     return SHARES[name] * options.hours * 3600.0
+
+
+def _physics(options: Options) -> tuple[str, ...]:
+    return ("--world", options.physics.world, "--body", options.physics.body)
 
 
 def _from_before(options: Options, option: str, product: str) -> tuple[str, ...]:
@@ -180,7 +183,8 @@ def _trainer(
 
 def _controller(options: Options) -> list[Stage]:
     run, teacher, student = options.run, PRODUCTS["teacher"], PRODUCTS["student"]
-    common = ("--seed", str(options.seed), "--task.world", options.world)
+    common = ("--seed", str(options.seed), "--task.world", options.physics.world)
+    common += ("--task.body", options.physics.body)
     judged = max(4, min(64, round(_JUDGED_PER_HOUR * options.hours)))
     common += ("--steps", str(_STEPS), "--evaluate-every", str(_EVALUATED_STEPS), "--evaluation-episodes", str(judged))
     train = "mujoban_controller.train"
@@ -238,6 +242,8 @@ def _senses(options: Options) -> list[Stage]:
         command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out)]
         command += ["--validation", str(validation.products[0]), "--streams", str(streams), "--shards", str(cores)]
         command += ["--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
+        for part in ("estimator", "termination"):
+            command += [f"--learner.{part}.body", options.physics.body]
         if start is not None:
             command += ["--start", str(start)]
         start = out
@@ -276,12 +282,13 @@ def _recording(options: Options, name: str) -> Stage:
     sense = ("--oracle", "estimator,termination") if first else ()
     modules = tuple(x for role, path in acting.items() for x in (f"--{role}", str(run / path)))
     episodes = max(8, round(_EPISODES_PER_HOUR * options.hours))
+    limit = _RECORDED_STEPS * get_body(options.physics.body).time_limit // BALL.time_limit
     stream = len(_LEVELS) * options.seed + _LEVELS[name]
     seed = TRAIN_SEEDS.start + stream * 10**9
     command = (
         "-m", "bringup.record", "--out", str(run / name), "--episodes", str(episodes),
-        "--seed", str(seed), "--run-seed", str(stream), "--time-limit", str(_RECORDED_STEPS),
-        "--processes", str(cores), "--world", options.world, *sense, *modules,
+        "--seed", str(seed), "--run-seed", str(stream), "--time-limit", str(limit),
+        "--processes", str(cores), *_physics(options), *sense, *modules,
     )  # fmt: skip
     seconds = _seconds(options, name)
     return Stage(name, command, (run / name,), tuple(needs.values()), seconds, cores, resumes=False)
@@ -294,7 +301,7 @@ def _evaluation(options: Options, name: str) -> Stage:
     report = run / f"{name}.json"
     command = (
         "-m", "bringup.evaluate", "--difficulty", "5", "--episodes", str(options.evaluation_episodes),
-        "--seed", str(FRESH_SEEDS.start), "--world", options.world, "--json", str(report),
+        "--seed", str(FRESH_SEEDS.start), *_physics(options), "--json", str(report),
         *weights, *EVALUATIONS[name].options,
     )  # fmt: skip
     needs = ("estimator_second", "planner_views", "controller_mpo")

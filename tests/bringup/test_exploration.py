@@ -1,11 +1,13 @@
 """Disturbed recordings: what the stack does, and more."""
 
 import numpy as np
+import pytest
 
-from bringup.exploration import Disturbance, DisturbedPlanner, disturbed
+from bringup.exploration import Disturbance, DisturbedController, DisturbedPlanner, disturbed
 from bringup.rollout import ticks
+from mujoban_core.bodies import BODIES
 from mujoban_core.grid import Instruction
-from mujoban_core.interfaces import Planner
+from mujoban_core.interfaces import Controller, ControllerInput, Planner
 from mujoban_core.look_around import look_around
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
@@ -77,3 +79,33 @@ def test_another_look_is_not_taken_for_the_end_of_wits_and_a_planner_that_stays_
 def test_a_disturbed_planner_goes_on_thinking():
     planner = DisturbedPlanner(Thinker(0), NONE, np.random.default_rng(0))
     assert planner.thinks and decisions(planner, 5)[1][1][0] == 5
+
+
+class Still(Controller):
+    """Gives no torque."""
+
+    def __init__(self, body):
+        self.size = body.action_size
+
+    def initial_memory(self, batch):
+        return ()
+
+    def step(self, inputs, state):
+        return np.zeros((len(inputs.instruction), self.size), np.float32), state
+
+
+@pytest.mark.parametrize("body", BODIES.values(), ids=BODIES)
+def test_torques_of_any_body_are_disturbed_and_those_turn_that_can(body):
+    steady = Disturbance(shaky=1.0, max_noise=0.0, spin=1.0, spin_again=0.0)
+    noisy = Disturbance(shaky=1.0, max_noise=0.4, spin=0.0, spin_again=0.0)
+    instruction, proprio = np.ones(64, np.int64), np.zeros((64, body.proprio_size), np.float32)
+    inputs = ControllerInput(instruction, np.zeros((64, 64, 64, 3), np.uint8), proprio, np.zeros(64, np.bool_))
+    turned, shaken = (
+        controller.step(inputs, controller.initial_memory(64))[0]
+        for controller in (DisturbedController(Still(body), d, np.random.default_rng(0), body) for d in (steady, noisy))
+    )
+    assert turned.shape == shaken.shape == (64, body.action_size) and shaken.any(axis=0).all()
+    if body.turn is None:
+        assert not turned.any()
+    else:
+        assert (np.sign(turned) == np.outer(np.sign(turned).sum(axis=1), np.sign(body.turn))).all() and turned.any()

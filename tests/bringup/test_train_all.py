@@ -13,6 +13,7 @@ import bringup.record
 import mujoban_controller.train
 import mujoban_estimator.train
 import mujoban_planner.train
+from bringup.options import WorldOptions
 from bringup.pipeline import Pipeline
 from bringup.train_all import PRODUCTS, WEIGHTS, Options, stages
 from bringup.training_report import EVALUATIONS, write_report
@@ -128,6 +129,14 @@ def test_the_senses_are_judged_on_bags_of_which_they_learn_nothing(tmp_path: Pat
 def test_continuing_what_is_not_finished_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"--continue .* lacks .*, expected the directory of a finished run"):
         Options(run=tmp_path / "run", before=tmp_path)
+
+
+def test_every_stage_but_the_planners_is_told_the_body_and_the_world(tmp_path: Path) -> None:
+    physics = WorldOptions("ant", "eased")
+    for name, command in commands(Options(run=tmp_path, physics=physics)).items():
+        told = {command[i + 1] for i, option in enumerate(command) if option.endswith("body")}
+        assert told == (set() if name.startswith("planner") else {"ant"}), name
+        assert "eased" in command or name.startswith(("planner", "estimator")), name
 
 
 @pytest.mark.parametrize("continued", [False, True])
