@@ -1,25 +1,27 @@
 """Four oracles on generated levels: shows that the world is sound, and what perfect modules would reach.
 
-``python -m benchmarks.oracles --levels 512`` prints JSON: solved levels with a 95 % Wilson interval, return, steps and
-instructions per episode, instructions that ran into their limit, and the steps that an instruction takes, by kind.
+A body that no script drives has its privileged teacher among them. ``python -m benchmarks.oracles --levels 512`` prints
+JSON: solved levels with a 95 % Wilson interval, return, steps and instructions per episode, instructions that ran into
+their limit, and the steps that an instruction takes, by kind.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
+from tyro.conf import arg
 
 from benchmarks.command import run_benchmark
+from bringup.command import Stack, oracle
+from bringup.options import WorldOptions
 from bringup.progress import EpisodesBar
 from bringup.rollout import ticks
-from mujoban_core.sense_plan_act import SensePlanAct
+from mujoban_core.plugins import ROLES
 from mujoban_core.stats import wilson_interval
 from mujoban_sim.goals import GoalKind
-from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
-from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
@@ -33,8 +35,7 @@ class Options:
     seed: int = 1000
     batch: int = 64
     threads: int = 2
-    world: str = DEFAULT_WORLD
-    """The physical world: reference or eased."""
+    physics: Annotated[WorldOptions, arg(name="")] = field(default_factory=WorldOptions)
 
 
 def run(options: Options | None = None) -> dict[str, Any]:
@@ -42,8 +43,9 @@ def run(options: Options | None = None) -> dict[str, Any]:
     options = options or Options()
     episodes = list(Episodes(options.levels, options.seed, difficulty=options.difficulty))
     batch = min(options.batch, len(episodes))
-    world = World(batch, world=options.world, threads=options.threads)
-    policy = SensePlanAct(OracleEstimator(), OracleTermination(), OraclePlanner(), OracleController())
+    body = options.physics.body
+    world = World(batch, body=body, world=options.physics.world, threads=options.threads)
+    policy = Stack({role: oracle(role, body) for role in ROLES}, body=body).policy()
     issued, timed_out, solved = 0, 0, []
     returns, lengths, unsolved = [], [], []
     durations: dict[GoalKind, list[int]] = {kind: [] for kind in GoalKind}

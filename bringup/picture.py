@@ -11,7 +11,7 @@ if __name__ == "__main__":
     end_at_once()
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -20,13 +20,13 @@ import tyro
 from numpy.typing import NDArray
 from PIL import Image
 
+from bringup.command import Stack, oracle
+from bringup.options import WorldOptions
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.files import check_file
 from mujoban_core.interfaces import Observation, module_seeds
+from mujoban_core.plugins import ROLES
 from mujoban_core.program import read_options, run_command
-from mujoban_core.sense_plan_act import SensePlanAct
-from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
-from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import generate_level
@@ -48,8 +48,7 @@ class Picture:
     """Seed of the episode, at least 0."""
     difficulty: int = 5
     """1 to 5."""
-    world: str = DEFAULT_WORLD
-    """The physical world: reference or eased."""
+    physics: Annotated[WorldOptions, tyro.conf.arg(name="")] = field(default_factory=WorldOptions)
     steps: int = 600
     """Steps of the episode to the last moment, at least 4; 20 are a second."""
 
@@ -68,9 +67,10 @@ def draw_picture(config: Picture) -> Image.Image:
     if config.steps < 4:
         raise ValueError(f"steps is {config.steps}: expected at least 4")
     level = generate_level(config.difficulty, config.seed)
-    world = World(1, world=config.world, max_boxes=len(level.boxes))
+    body = config.physics.body
+    world = World(1, body=body, world=config.physics.world, max_boxes=len(level.boxes))
     world.reset([0], [EpisodeSpec(level, config.seed)])
-    policy = SensePlanAct(OracleEstimator(), OracleTermination(), OraclePlanner(), OracleController())
+    policy = Stack({role: oracle(role, body) for role in ROLES}, body=body).policy()
     state = policy.initial_state(module_seeds(0, np.array([1])))
     unseen = np.zeros((1, FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
     views = []

@@ -27,6 +27,7 @@ from bringup.rollout import ticks
 from mujoban_core.files import write_atomically
 from mujoban_core.grid import CONTROL_PERIOD, Instruction
 from mujoban_core.plugins import LEARNED, ROLES
+from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
@@ -56,7 +57,7 @@ def record(seed: int = SEED, difficulty: int = DIFFICULTY, stack: Stack | None =
     episodes = Episodes(_CANDIDATES, seed, difficulty=difficulty)
     torque: list[list[NDArray[np.float32]]] = [[] for _ in episodes]
     instructions: list[list[tuple[int, int]]] = [[] for _ in episodes]
-    world = World(len(episodes), max_boxes=episodes.max_boxes)
+    world = World(len(episodes), body=stack.body, max_boxes=episodes.max_boxes)
     for tick in ticks(stack.policy(), world, episodes):
         for m, index in enumerate(tick.episode.tolist()):
             torque[index].append(tick.decision.torque[m].copy())
@@ -71,6 +72,8 @@ def record(seed: int = SEED, difficulty: int = DIFFICULTY, stack: Stack | None =
     content = {
         "seed": seed + first,
         "difficulty": difficulty,
+        "body": stack.body,
+        "world": DEFAULT_WORLD,
         "weights": stack.identities(),
         "instructions": instructions[first],
         # The shortest decimals that give the same float32 again.
@@ -102,7 +105,8 @@ def play(
     """
     torque = np.array(episode["torque"], np.float32)
     levels = Episodes(1, episode["seed"], difficulty=episode["difficulty"])
-    world = World(1, max_boxes=levels.max_boxes)
+    physics = {name: episode[name] for name in ("body", "world") if name in episode}
+    world = World(1, **physics, max_boxes=levels.max_boxes)
     world.reset([0], [levels[0]])
     for step in range(len(torque) + 1):
         if step in moments:
