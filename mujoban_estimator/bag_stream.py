@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from mujoban_core.interfaces import NO_INSTRUCTION
+from mujoban_core.memory import available_memory
 from mujoban_estimator.data import Stretch
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
@@ -25,8 +26,8 @@ TOPICS: Final = (
     topics.TRUE_TERMINATION,
 )
 """What training needs of a bag."""
-KEPT_BYTES: Final = 2**31
-"""Most memory that the bags take which a training keeps: some 170,000 ticks, of which each has 12.5 KB."""
+_KEPT_SHARE: Final = 1 / 3
+"""Of the memory that is available: what the bags take which a training keeps, by default."""
 
 
 class _Episode:
@@ -76,10 +77,13 @@ def stretches(
 class KeptBags:
     """Stretches of bags that have been read to their end, for the rounds to come: reading costs much."""
 
-    def __init__(self, limit: int = KEPT_BYTES) -> None:
-        """Keep bags, the first that are read, up to so many bytes in all; the others are read again."""
+    def __init__(self, limit: int | None = None) -> None:
+        """Keep bags, the first that are read, up to so many bytes in all; the others are read again.
+
+        A tick has 12.5 KB. The limit is by default a third of the memory that is available.
+        """
         self._bags: dict[Path, list[Stretch]] = {}
-        self._free = limit
+        self._free = int(_KEPT_SHARE * available_memory()) if limit is None else limit
 
     def get(self, path: Path) -> list[Stretch] | None:
         """Return the stretches of a bag that is kept."""
