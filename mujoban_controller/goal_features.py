@@ -58,6 +58,8 @@ class FeatureLayout(NamedTuple):
     """Proprioception as each side sees it, [S, P]."""
     actuators: NDArray[np.int64]
     """Order of actuators as each side sees them, [S, U]."""
+    holds: int
+    """Where it stands that the robot is to hold."""
 
     def torque_of(self, action: NDArray[np.float32], side: NDArray[np.int64]) -> NDArray[np.float32]:
         """Return the torques, [B, U], of actions as the sides ahead see them, [B, U]; `side` is [B]."""
@@ -99,7 +101,8 @@ def feature_layout(body: Body) -> FeatureLayout:
         start += len(block)
     mirror = Rearrangement(np.concatenate(sources), np.concatenate([s for _, s in blocks]).astype(np.float32))
     seen = Rearrangement(views[0], views[1].astype(np.float32))
-    return FeatureLayout(start, mirror, Rearrangement(acting, acting_sign.astype(np.float32)), seen, actuators)
+    holds = start - 2 * len(_NEIGHBOURS) - 2  # the last of the goal's kinds, behind which the elapsed time stands
+    return FeatureLayout(start, mirror, Rearrangement(acting, acting_sign.astype(np.float32)), seen, actuators, holds)
 
 
 def _turn(v: NDArray[np.floating], axis: NDArray[np.float64]) -> NDArray[np.floating]:

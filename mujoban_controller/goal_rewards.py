@@ -3,7 +3,8 @@
 The paper's terms are a bonus for a completed instruction, a cost of one that failed and a small one of going
 backwards. They come seldom; so progress is rewarded as well, as the change of a potential over states (Ng et al.
 1999), which looks at where a pushed box will come to rest. And what loses levels later has a price: boxes that leave
-the middle of their lanes jam at pegs.
+the middle of their lanes jam at pegs. A robot that no single action turns on the spot learns to turn while it is told
+to stay, so that its camera sees to all sides.
 
 Shapes: B robots, U actuators.
 """
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_controller.goal_features import GoalView, drift, rest_position
-from mujoban_core.grid import INSTRUCTION_AXES, OFFSETS_XY
+from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, OFFSETS_XY, Instruction
 from mujoban_sim.driving import forward_speed, wrap_angles
 from mujoban_sim.goals import GoalKind
 
@@ -51,6 +52,10 @@ class RewardConfig:
     """Cost of a tick in which no side of the robot looks along the instruction."""
     tilt: float = 0.1
     """Cost of a tick in which the robot lies on its side."""
+    turn: float = 1.0
+    """Of each radian by which a robot turns to its left while it is to hold, where no single action turns it."""
+    fastest_turn: float = 2.0
+    """Radians per second beyond which turning faster earns no more."""
     backwards: float = 0.0
     """Cost of a tick in which the robot moves backwards."""
 
@@ -105,6 +110,8 @@ class GoalReward:
         there, drifted = before
         reward = c.progress * (potential(world, c) - there)
         reward += c.completed * completed + c.failed * failed
+        if body.turn is None:
+            reward += self._turning(world) - c.completed * (completed & (world.goals.direction == Instruction.STAY))
         reward -= c.drift * (drift(world) - drifted)
         reward -= c.time + c.effort * np.square(change).sum(1) + c.tilt * (1.0 - upright(world))
         reward -= c.heading * self._off_course(world)
@@ -114,6 +121,13 @@ class GoalReward:
         if c.backwards > 0.0:
             reward -= c.backwards * (forward_speed(world.pose, world.velocity, body.cell_size) < -0.05)
         return np.where(fallen(world), c.fallen, reward).astype(np.float32)
+
+    def _turning(self, world: GoalView) -> NDArray[np.float64]:
+        """Return what turning to the left earns where there is nothing else to do, [B]."""
+        at, c = world.body.proprio, self.config
+        rate = (world.proprio[:, at.angular_velocity] * world.proprio[:, at.up_axis]).sum(1)
+        turned = np.clip(rate, -c.fastest_turn, c.fastest_turn) * CONTROL_PERIOD
+        return c.turn * turned * (world.goals.kind == GoalKind.HOLD)
 
     def _off_course(self, world: GoalView) -> NDArray[np.float64]:
         """Return 0 where a side looks along the instruction, up to 1 halfway between two, [B]."""

@@ -81,6 +81,6 @@ def judging_config(
         misaligned=0.0,
         overshoot=math.inf,
         patience=12,
-        instructions=InstructionConfig(stay=0.1, infeasible=0.2),
+        instructions=InstructionConfig(stay=0.1, infeasible=0.2, stays_on=0.0),
         terminations=EXACT,
     )

@@ -389,6 +389,9 @@ class GoalTask:
                 )
         issued = np.zeros(world.batch, np.bool_)
         issued[rows] = True
+        if world.body.turn is None:
+            goes_on = self._rng.random(world.batch) < self.config.instructions.stays_on
+            self.instruction[issued & ~self.first & (previous == Instruction.STAY) & goes_on] = Instruction.STAY
         world.instruct(self.instruction, issued)
         self._start_boxes[rows] = world.box_cell[rows]
         self._noise.issue(rows)

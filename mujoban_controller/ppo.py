@@ -148,6 +148,7 @@ class PPOLearner(ProductLearner[Rollout]):
         self.value = Value(body)
         layout = feature_layout(get_body(body))
         self._mirror, self._mirror_action = layout.mirror, layout.mirror_action
+        self._turning = layout.holds if get_body(body).turn is None else None
         self._adam = torch.optim.Adam([*policy.parameters(), *self.value.parameters()], config.rate, eps=1e-5)
         self._generator = generator
         self._rounds = 0
@@ -225,7 +226,11 @@ class PPOLearner(ProductLearner[Rollout]):
         loss = loss + config.bound_weight * bound
         if config.mirror_weight > 0.0:
             other = mirrored(self.policy(mirrored(features, self._mirror)).mean, self._mirror_action)
-            asymmetry = (policy.mean - other).square().mean()
+            error = (policy.mean - other).square().mean(-1)
+            if self._turning is not None:
+                # A look around has a side to which it turns.
+                error = error * (1.0 - features[..., self._turning])
+            asymmetry = error.mean()
             loss = loss + config.mirror_weight * asymmetry
             stats["asymmetry"] = asymmetry.detach()
         return loss, {**stats, "scale": policy.scale.detach().mean()}

@@ -191,7 +191,8 @@ class Body:
         camera: how the body carries its first-person camera.
         mjcf: the ``<body>`` element, with the camera `FIRST_PERSON_CAMERA` and the site ``imu``; the figures of
             `RobotPhysics` stand in braces, for `fragment` to fill in.
-        turn: the action, U values in [-1, 1], that turns it to its left on the spot; None where no single one does.
+        turn: the action, U values in [-1, 1], that turns it to its left on the spot; None where no single one does, and
+            its controller learns to turn while it is told to stay.
     """
 
     name: str

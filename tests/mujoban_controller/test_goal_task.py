@@ -10,13 +10,14 @@ import pytest
 from mujoban_controller.drivers import ControllerDriver
 from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_features import feature_layout
+from mujoban_controller.goal_rewards import GoalReward, RewardConfig
 from mujoban_controller.goal_settings import GoalTaskConfig, judging_config
 from mujoban_controller.goal_task import GoalTask
-from mujoban_controller.instructions import EXACT
+from mujoban_controller.instructions import EXACT, InstructionConfig
 from mujoban_controller.judge import failure_name, judge
 from mujoban_controller.scripted import scripted_driver
 from mujoban_core.bodies import BALL
-from mujoban_core.grid import OFFSETS_XY, Instruction
+from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction
 from mujoban_core.interfaces import Planner
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.oracles import OracleController, OraclePlanner
@@ -192,3 +193,41 @@ def test_settings_that_contradict_the_evaluation_are_refused():
         GoalTaskConfig(retry=2.0)
     with pytest.raises(ValueError, match="difficulty 9"):
         judging_config(4, difficulty=9)
+
+
+def turning_is_worth(body):
+    """Return what a tick in which the robot turns to its left at 1 rad/s is worth more than one at rest."""
+    settings = InstructionConfig(stay=1.0)
+    task = make(body=body, planned=0.0, misaligned=0.0, instructions=settings, terminations=EXACT)
+    world, ends, reward = task.world, np.zeros((2, 4), np.bool_), GoalReward(RewardConfig())
+    there, still = reward.before(world), np.zeros((4, world.body.action_size), np.float32)
+    at = world.body.proprio
+    world.proprio[:, at.up_axis] = 0.0, 0.0, 1.0
+    worth = []
+    for rate in (0.0, 1.0):
+        world.proprio[:, at.angular_velocity] = 0.0, 0.0, rate
+        worth.append(reward.after(world, there, still, *ends))
+    assert (world.goals.kind == GoalKind.HOLD).all()
+    assert (task.features()[:, feature_layout(world.body).holds] == 1.0).all()
+    return worth[1] - worth[0]
+
+
+def test_to_turn_is_rewarded_where_no_single_action_does_it():
+    assert turning_is_worth("ball") == pytest.approx(np.zeros(4))
+    assert turning_is_worth("ant") == pytest.approx(np.full(4, RewardConfig().turn * CONTROL_PERIOD), abs=1e-5)
+
+
+@pytest.mark.parametrize(("stays_on", "least", "most"), [(1.0, 1.0, 1.0), (0.0, 0.0, 0.5)])
+def test_a_body_that_learns_to_turn_is_told_to_stay_for_long(stays_on, least, most):
+    settings = InstructionConfig(stay=0.1, stays_on=stays_on)
+    task = make(
+        GoalTaskConfig(batch=64, difficulty=1), body="ant", planned=0.0, misaligned=0.0, horizon=np.inf,
+        instructions=settings, terminations=EXACT,
+    )  # fmt: skip
+    after = []
+    for _ in range(20):
+        stay = task.instruction == Instruction.STAY
+        play(task, 1, lambda task: np.zeros((64, task.world.body.action_size), np.float32))
+        going_on = stay & task.terminated
+        after += (task.instruction == Instruction.STAY)[going_on].tolist()
+    assert len(after) > 3 and least <= np.mean(after) <= most
