@@ -101,6 +101,16 @@ class Pipeline:
         self._running: dict[str, tuple[subprocess.Popen[bytes], float]] = {}
         self._cpu_seconds = _spent_by_children()
 
+    @classmethod
+    def read(cls, directory: Path) -> Pipeline:
+        """Return a run as its record has it, which knows no needs.
+
+        Raises:
+            PipelineError: If the record is damaged.
+        """
+        stored = _stored(directory / "pipeline.json")
+        return cls(directory, [Stage(name, tuple(entry.command), ()) for name, entry in stored.items()])
+
     def _check_command(self, stage: Stage) -> None:
         entry = self.entries[stage.name]
         if entry.done and entry.command != list(stage.command):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,6 +21,8 @@ from mujoban_core.text import readable
 from mujoban_sokoban.generator import FRESH_SEEDS
 
 _PREFIX = "evaluation/"
+_RECORDED: Final = re.compile(r"^(\d+) ticks of ", re.MULTILINE)
+"""What `bringup.record` says at its end."""
 
 
 class Evaluation(NamedTuple):
@@ -50,7 +53,7 @@ def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> P
         text = card(target, f"weights/{role}.safetensors", _PLACE, scores)
         write_atomically(target.with_suffix(".md"), text.encode())
     figure = draw_curves(run, [s.name for s in pipeline.stages], run / "curves.png")
-    lines = [*_summary(evaluations, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
+    lines = [*_summary(run, evaluations, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
     if figure:
         lines += ["", "![Validation scores against CPU seconds](curves.png)"]
     path = run / "report.md"
@@ -94,18 +97,38 @@ def _rates(metrics: Path) -> dict[str, list[tuple[float, float]]]:
     return {k: v for k, v in read_curves(metrics).items() if all(0.0 <= y <= 1.0 for _, y in v)}
 
 
+def cost(run: Path) -> dict[str, float]:
+    """Return environment steps, CPU seconds and seconds by the clock of a run whose stages have all ended.
+
+    Raises:
+        PipelineError: If its record is damaged.
+    """
+    pipeline = Pipeline.read(run)
+    spent = sum(entry.cpu_seconds for entry in pipeline.entries.values())
+    return {"step": _steps(run), "cpu_seconds": round(spent), "seconds": round(pipeline.seconds())}
+
+
+def _steps(run: Path) -> int:
+    """Return the environment steps of the controller's trainings and of what was recorded."""
+    logs = (run / "logs").glob("bags_*.txt")
+    recorded = sum(int(ticks) for log in logs for ticks in _RECORDED.findall(log.read_text()))
+    metrics = (run / stage / "metrics.jsonl" for stage in ("teacher", "controller_distil", "controller_mpo"))
+    return recorded + sum(json.loads(file.read_text().splitlines()[-1])["step"] for file in metrics if file.exists())
+
+
 def _score(name: str, report: Mapping[str, Any]) -> Score:
     levels = len(report["episodes"])
     return Score(EVALUATIONS[name].title, "none", levels, report["success_rate"], report["success_interval"])
 
 
-def _summary(evaluations: Mapping[str, Mapping[str, Any]], pipeline: Pipeline) -> Iterator[str]:
+def _summary(run: Path, evaluations: Mapping[str, Mapping[str, Any]], pipeline: Pipeline) -> Iterator[str]:
     spent = sum(entry.cpu_seconds for entry in pipeline.entries.values())
     yield "# Weights from nothing"
     yield ""
     yield (
         f"All stages together took {pipeline.seconds() / 3600:.2f} hours by the clock, some of them side by side on "
-        f"{pipeline.cores} cores, and {spent / 3600:.2f} hours of the processor."
+        f"{pipeline.cores} cores, {spent / 3600:.2f} hours of the processor, and {readable(_steps(run))} environment "
+        "steps."
     )
     if not evaluations:
         return

@@ -91,7 +91,7 @@ def rebuild(folder: Path) -> Path:
         tables.configurations(CONFIGURATIONS[:1]),
         TABLE_1,
         tables.baselines(CONFIGURATIONS[0]),
-        "Every row but the modular one is given the same environment steps and CPU time, by\n",
+        "Every row but that of the stack as it ships is given the same hours of two cores, by\n",
         tables.commands(),
         "Why episodes of difficulty 5 fail, before fine-tuning as a whole and after:\n",
         tables.failures((CONFIGURATIONS[0], JOINT.run(CONFIGURATIONS[0].difficulty))),

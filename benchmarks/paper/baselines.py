@@ -21,14 +21,25 @@ import tyro
 from benchmarks.paper import runs as sources
 from benchmarks.paper.curves import read_metrics
 from benchmarks.paper.runs import ROOT, ResultError, Run
+from bringup.training_report import cost
 from mujoban_core.files import write_atomically
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.plugins import ROLES
 from mujoban_core.program import read_options, run_command
+from mujoban_sim.presets import DEFAULT_WORLD
 
 PROG: Final = "benchmarks.paper.baselines"
 _MOST: Final = 100
 """Points of a curve; more are averaged."""
 _KINDS: Final = ("solved", "return")
+
+
+HOURS: Final = 1.0
+"""Of wall-clock on two cores that every row may take, the modular stack's as well."""
+BUDGET: Final = f"--steps {2_500_000 * HOURS:.0f} --cpu-seconds {2 * 3600 * HOURS:.0f}"
+"""What completes a run of an agent, whichever comes first; the same for all."""
+RECORDING: Final = "python bringup/record.py --out bags/stack --undisturbed --episodes 512"
+"""Records what is cloned; without `--undisturbed` the disturbances would be cloned too."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +52,15 @@ class Baseline:
     levels: str
     """What it is trained on."""
     method: str
-    """Arguments of `python -m mujoban_baselines.train`, but for budget and run directory."""
+    """Arguments of the program that trains it, but for budget and run directory."""
     paper: str
     """How long the paper trained it, with how many actors."""
-    modules: bool = False
-    """Whether it leaves controller and planner, which play with the modules that ship, in the place of an agent."""
+    roles: tuple[str, ...] = ()
+    """Modules that it leaves, in the place of an agent; they play with those that ship."""
+    program: str = "mujoban_baselines.train"
+    budget: str = BUDGET
+    weights: str = ""
+    """Folder of its run that holds the weights."""
 
     @property
     def folder(self) -> Path:
@@ -55,7 +70,7 @@ class Baseline:
     @property
     def command(self) -> str:
         """The command that trains it."""
-        return f"python -m mujoban_baselines.train {self.method} {BUDGET} --run runs/baselines/{self.name}"
+        return f"python -m {self.program} {self.method} {self.budget} --run runs/baselines/{self.name}"
 
     @property
     def curve(self) -> Path:
@@ -65,22 +80,21 @@ class Baseline:
     def run(self, difficulty: int) -> Run:
         """Return its evaluation at a difficulty."""
         run = Run(f"{self.name}_{difficulty}", self.title, difficulty)
-        if not self.modules:
-            return replace(run, agent=self.folder / "agent.safetensors")
-        return replace(
-            run, controller=self.folder / "controller.safetensors", planner=self.folder / "planner.safetensors"
-        )
+        folder = self.folder / self.weights
+        if not self.roles:
+            return replace(run, agent=folder / "agent.safetensors")
+        return replace(run, modules=tuple((role, folder / f"{role}.safetensors") for role in self.roles))
 
 
-HOURS: Final = 8.0
-"""Of wall-clock on two cores: what `make weights` takes for the whole stack, and every row may take."""
-BUDGET: Final = f"--steps 20000000 --cpu-seconds {2 * 3600 * HOURS:.0f}"
-"""What completes a run, whichever comes first; the same for all rows."""
-RECORDING: Final = "python bringup/record.py --out bags/stack --undisturbed --episodes 512"
-"""Records what is cloned; without `--undisturbed` the disturbances would be cloned too."""
 _ROBOT, _ABOVE = "o_cam, o_pr, o_pos", "o_top, o_pr"
 _PARTIAL, _FULL, _NOT = "5 days, 256 actors", "21 days, 1,000 actors", "not there"
+MODULAR: Final = Baseline(
+    "modular", "modular", _ROBOT, "hard, bottom-up ([how](../weights.md))", f"--world {DEFAULT_WORLD}",
+    "7 days, 200 to 1,000 actors a module", tuple(ROLES), "bringup.train_all", f"--hours {HOURS:g}", "weights",
+)  # fmt: skip
+"""The stack, from nothing within the same hours."""
 BASELINES: Final = (
+    MODULAR,
     Baseline("mpo_hard", "MPO, asym.", _ROBOT, "hard", "monolithic-mpo", _PARTIAL),
     Baseline("mpo_hard_sym", "MPO, sym.", _ROBOT, "hard", "monolithic-mpo --critic symmetric", _PARTIAL),
     Baseline("mpo_curriculum", "MPO, asym.", _ROBOT, "curriculum", "monolithic-mpo --levels curriculum", _PARTIAL),
@@ -93,9 +107,12 @@ BASELINES: Final = (
     Baseline("clone", "cloning of the stack alone", _ROBOT, "bags", "clone --bags bags/stack", _NOT),
     Baseline("vtrace", "V-trace", _ABOVE, "curriculum", "monolithic-vtrace", _FULL),
     Baseline("structured", "structured V-trace", f"{_ABOVE}, s_abst", "curriculum", "structured-vtrace", _FULL),
-    Baseline("joint", "modular, fine-tuned as a whole", _ROBOT, "hard, from the modular row", "joint", _NOT, True),
+    Baseline(
+        "joint", "modular, fine-tuned as a whole", _ROBOT, "hard, from the row as it ships", "joint", _NOT,
+        ("controller", "planner"),
+    ),
 )  # fmt: skip
-"""The agents of appendix D, a monolithic one that may copy, and the stack fine-tuned for the task's reward."""
+"""The stack, the agents of appendix D, a monolithic one that may copy, the stack fine-tuned for the task's reward."""
 JOINT: Final = BASELINES[-1]
 RUNS: Final = tuple(baseline.run(d) for baseline in BASELINES for d in DIFFICULTIES)
 """Their evaluations."""
@@ -110,11 +127,13 @@ class Options:
 
 
 def read_curve(run: Path) -> list[dict[str, Any]]:
-    """Return at most `_MOST` points of a run, each the mean over a stretch of it.
+    """Return at most `_MOST` points of a run, each the mean over a stretch of it; of the stack's, what it cost alone.
 
     Raises:
         ResultError: If it has no metrics.
     """
+    if (run / "pipeline.json").exists():
+        return [cost(run) | {kind: {} for kind in _KINDS}]
     lines = read_metrics(run)
     if not lines:
         raise ResultError(f"{run}: its metrics are empty")

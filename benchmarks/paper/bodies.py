@@ -36,7 +36,7 @@ def _run(body: str, difficulty: int) -> Run:
     return Run(
         f"{body}_{difficulty}", f"{_TITLES[body]}, difficulty {difficulty}", difficulty, SENSE,
         _PAPER[body] if difficulty == max(DIFFICULTIES) else None, body=body, world=REFERENCE.name,
-        controller=_CONTROLLERS[body],
+        modules=(("controller", _CONTROLLERS[body]),),
     )  # fmt: skip
 
 

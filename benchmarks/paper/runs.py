@@ -52,10 +52,8 @@ class Run:
     """Weights of an agent that plays in the place of the stack."""
     body: str = BALL.name
     world: str = DEFAULT_WORLD
-    controller: Path | None = None
-    """Weights of the controller, where others than those that ship play."""
-    planner: Path | None = None
-    """The same of the planner."""
+    modules: tuple[tuple[str, Path], ...] = ()
+    """Roles of modules, and weights other than those that ship which play them."""
     further: tuple[str, ...] = ()
     """Further options of `bringup/evaluate.py`."""
 
@@ -77,8 +75,7 @@ class Run:
     @property
     def own(self) -> dict[str, Path]:
         """Weights other than those that ship, by the role that they play."""
-        given = {AGENT: self.agent, "controller": self.controller, "planner": self.planner}
-        return {role: path for role, path in given.items() if path is not None}
+        return ({} if self.agent is None else {AGENT: self.agent}) | dict(self.modules)
 
     def options(self) -> list[str]:
         """Return the options of `bringup/evaluate.py` but for levels, seed and report."""

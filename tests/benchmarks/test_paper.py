@@ -6,6 +6,7 @@ import pytest
 
 from benchmarks.paper import __main__ as results
 from benchmarks.paper import baselines, bodies, curves, figures, film, parts, runs, tables
+from bringup import train_all
 from bringup.command import Choice, Stack
 from bringup.results import EpisodeResult, report, write_report
 from mujoban_baselines.train import COMMANDS, PROG
@@ -168,7 +169,7 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
     rates = "75.0 % (30.1 to 95.4) | - | - | - | -"
     assert f"| MPO, asym. | o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 0.5 | 5 days, 256 actors | 4 | {rates} |" in page
     assert (folder / "baselines.png").stat().st_size and "--agent" in row.run(1).options()
-    with pytest.raises(ValueError, match="nobody=x: expected NAME=RUN with a name among mpo_hard"):
+    with pytest.raises(ValueError, match="nobody=x: expected NAME=RUN with a name among modular, mpo_hard"):
         baselines.main(["nobody=x"])
     row.curve.write_text("{}\n")
     with pytest.raises(runs.ResultError, match=r"rerun python -m benchmarks\.paper\.baselines mpo_easy"):
@@ -207,9 +208,34 @@ def test_the_fine_tuned_stack_has_a_row_and_its_failures_beside_what_it_came_fro
 
 def test_every_row_is_trained_by_a_command_that_exists_with_the_same_budget(capsys):
     for row in baselines.BASELINES:
-        assert row.command in tables.commands() and baselines.BUDGET in row.command
-        arguments = row.command.removeprefix("python -m mujoban_baselines.train ").split()
+        assert row.command in tables.commands()
+        _, _, program, *arguments = row.command.split()
+        if row is baselines.MODULAR:
+            assert program == train_all.PROG and read_options(train_all.Options, arguments, PROG).hours == 1.0
+            continue
+        assert program == PROG and baselines.BUDGET in row.command
         assert isinstance(read_options(COMMANDS, arguments, PROG), COMMANDS[arguments[0]])
+
+
+def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_path):
+    entry = {"command": ["-m", "x"], "done": True, "cpu_seconds": 3600.0, "spans": [[0.0, 1800.0]]}
+    (tmp_path / "pipeline.json").write_text(json.dumps({"teacher": entry, "bags_first": {**entry, "cpu_seconds": 0.0}}))
+    for name, file, text in (
+        ("teacher", "metrics.jsonl", '{"step": 5}\n{"step": 1000000}\n'),
+        ("logs", "bags_first.txt", "1 of 180 episodes recorded\n500000 ticks of 180 episodes in 32 bags\n"),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / file).write_text(text)
+    assert baselines.main([f"modular={tmp_path}"]) == 0
+    run = baselines.MODULAR.run(5)
+    options = run.options()
+    for role in ROLES:
+        weights = runs.ROOT / f"runs/baselines/modular/weights/{role}.safetensors"
+        assert options[options.index(f"--{role}") + 1] == str(weights)
+    write(run, 2, 4, {})
+    page = results.rebuild(folder).read_text()
+    cells = "1.50 M | 1.0 | 0.5 | 7 days, 200 to 1,000 actors a module | 4 | - | - | - | - | 50.0 % (15.0 to 85.0)"
+    assert f"| modular | o_cam, o_pr, o_pos | hard, bottom-up ([how](../weights.md)) | {cells} |" in page
 
 
 @pytest.fixture
@@ -267,7 +293,7 @@ def test_the_planners_curves_have_the_names_that_are_given(tmp_path, drawn):
 def test_figure_5_has_both_bodies_and_marks_a_controller_that_is_another_now(folder):
     shipped = {role: digest(shipped_weights(role)) for role in ROLES}
     ant = bodies.BODIES["ant"]
-    write(ant[4], 3, 4, {**shipped, "controller": f"{digest(ant[4].controller)} (privileged)"})
+    write(ant[4], 3, 4, {**shipped, "controller": f"{digest(ant[4].own['controller'])} (privileged)"})
     write(ant[3], 4, 4, {**shipped, "controller": f"{'0' * 64} (privileged)"})
     assert results.rebuild(folder) == folder / "README.md"
     page = (folder / "README.md").read_text()

@@ -117,9 +117,12 @@ def test_a_trainer_that_is_stopped_alone_is_not_done(tmp_path):
     small = ("--channels", "8", "--blocks", "1", "--run", str(folder))
     run = Pipeline(tmp_path, [Stage("train", ("-m", "mujoban_planner.train", "expert-iteration", *small), (product,))])
 
+    told = []
+
     def stop_trainer(pipeline):
         for process, _ in pipeline._running.values():
-            if metrics.exists():
+            if metrics.exists() and not told:
+                told.append(process)
                 process.send_signal(signal.SIGTERM)
 
     with pytest.raises(PipelineError, match=r"(?s)stage train ended with 143; .*the same command goes on from there"):
