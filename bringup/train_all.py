@@ -80,8 +80,13 @@ _EPISODES_PER_HOUR: Final = 90
 """Recorded in each round, per hour of the whole run."""
 _RECORDED_STEPS: Final = 900
 """Longest recorded episode of the ball; a body that has more time for a level has more here."""
-_EVALUATED_STEPS: Final = 500_000
-"""Environment steps of the controller's training between two evaluations, which no budget counts."""
+_EVALUATED_STEPS: Final = 125_000
+"""Environment steps of the controller's training between two evaluations, per hour of the whole run; at most half a
+million. No budget counts them."""
+_PLANNER_EVALUATIONS: Final = 5
+"""Of each training of the planner."""
+_SENSES_EVALUATIONS: Final = 500
+"""Updates between two evaluations of the senses, per hour of the whole run."""
 _JUDGED_PER_HOUR: Final = 16
 """Validation levels of each such evaluation, per hour of the whole run; at most 64."""
 _SENSES: Final = ("--learner.slip", "0.015", "--learner.lost", "0.05")
@@ -186,7 +191,8 @@ def _controller(options: Options) -> list[Stage]:
     common = ("--seed", str(options.seed), "--task.world", options.physics.world)
     common += ("--task.body", options.physics.body)
     judged = max(4, min(64, round(_JUDGED_PER_HOUR * options.hours)))
-    common += ("--steps", str(_STEPS), "--evaluate-every", str(_EVALUATED_STEPS), "--evaluation-episodes", str(judged))
+    every = round(min(4.0, options.hours) * _EVALUATED_STEPS)
+    common += ("--steps", str(_STEPS), "--evaluate-every", str(every), "--evaluation-episodes", str(judged))
     train = "mujoban_controller.train"
     return [
         _trainer(
@@ -209,8 +215,12 @@ def _controller(options: Options) -> list[Stage]:
 
 def _planner(options: Options) -> list[Stage]:
     """Return the stages of the planner: boards in full view, then also boards as an estimator sees them."""
-    method = ("mujoban_planner.train", "expert-iteration", "--evaluate-every", "900")
-    first, second = (("--seed", str(2 * options.seed + i)) for i in range(2))  # each has levels of its own
+    method = ("mujoban_planner.train", "expert-iteration")
+    every = (max(1, round(_seconds(options, n) / _PLANNER_EVALUATIONS)) for n in ("planner", "planner_views"))
+    # Each has levels of its own.
+    first, second = (
+        ("--seed", str(2 * options.seed + i), "--evaluate-every", str(seconds)) for i, seconds in enumerate(every)
+    )
     whole = PRODUCTS["whole"]
     views = ("--init", str(options.run / whole), "--learning-rate", "7e-4", *_VIEWS)
     return [
@@ -241,7 +251,8 @@ def _senses(options: Options) -> list[Stage]:
         streams = _STREAMS_ALONE if cores == 1 else _STREAMS_EACH * cores
         command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out)]
         command += ["--validation", str(validation.products[0]), "--streams", str(streams), "--shards", str(cores)]
-        command += ["--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
+        every = max(1, round(_SENSES_EVALUATIONS * options.hours))
+        command += ["--evaluate-every", str(every), "--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
         for part in ("estimator", "termination"):
             command += [f"--learner.{part}.body", options.physics.body]
         if start is not None:

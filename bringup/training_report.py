@@ -21,6 +21,10 @@ from mujoban_core.text import readable
 from mujoban_sokoban.generator import FRESH_SEEDS
 
 _PREFIX = "evaluation/"
+_RATES: Final = (
+    "success_rate", "agent_accuracy", "boxes_all_right_if_seen", "termination_precision", "termination_recall",
+)  # fmt: skip
+"""Scores that are drawn, of all that start so; the table has steps as well."""
 _RECORDED: Final = re.compile(r"^(\d+) ticks of ", re.MULTILINE)
 """What `bringup.record` says at its end."""
 
@@ -91,10 +95,10 @@ def draw_curves(run: Path, names: list[str], path: Path) -> bool:
 
 
 def _rates(metrics: Path) -> dict[str, list[tuple[float, float]]]:
-    """Return the curves that stay within [0, 1], which are rates."""
+    """Return the curves that are drawn."""
     if not metrics.exists():
         return {}
-    return {k: v for k, v in read_curves(metrics).items() if all(0.0 <= y <= 1.0 for _, y in v)}
+    return {name: points for name, points in read_curves(metrics).items() if name.startswith(_RATES)}
 
 
 def cost(run: Path) -> dict[str, float]:
@@ -154,7 +158,7 @@ def _stages(run: Path, pipeline: Pipeline) -> Iterator[str]:
     for stage in pipeline.stages:
         record = _record(run, stage.products)
         metrics = record.get("metrics", {})
-        scores = ", ".join(f"{k} {readable(v)}" for k, v in metrics.items() if isinstance(v, (int, float)))
+        scores = ", ".join(f"{k} {readable(v)}" for k, v in metrics.items() if k.startswith((*_RATES, "steps")))
         done = (readable(record[kind]) if kind in record else "" for kind in ("samples", "updates"))
         entry = pipeline.entries[stage.name]
         minutes = (readable(seconds / 60) for seconds in (entry.seconds, entry.cpu_seconds))
