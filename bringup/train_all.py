@@ -81,8 +81,8 @@ _EPISODES_PER_HOUR: Final = 90
 _RECORDED_STEPS: Final = 900
 """Longest recorded episode of the ball; a body that has more time for a level has more here."""
 _EVALUATED_STEPS: Final = 125_000
-"""Environment steps of the controller's training between two evaluations, per hour of the whole run; at most half a
-million. No budget counts them."""
+"""Environment steps of the controller's training between two evaluations, per hour of the whole run, from one hour on
+up to four. No budget counts them, and those of what has hardly learned yet take long."""
 _PLANNER_EVALUATIONS: Final = 5
 """Of each training of the planner."""
 _SENSES_EVALUATIONS: Final = 500
@@ -191,7 +191,7 @@ def _controller(options: Options) -> list[Stage]:
     common = ("--seed", str(options.seed), "--task.world", options.physics.world)
     common += ("--task.body", options.physics.body)
     judged = max(4, min(64, round(_JUDGED_PER_HOUR * options.hours)))
-    every = round(min(4.0, options.hours) * _EVALUATED_STEPS)
+    every = round(min(max(1.0, options.hours), 4.0) * _EVALUATED_STEPS)
     common += ("--steps", str(_STEPS), "--evaluate-every", str(every), "--evaluation-episodes", str(judged))
     train = "mujoban_controller.train"
     return [
