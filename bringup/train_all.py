@@ -354,7 +354,7 @@ class Display:
             shown = stage.seconds if done else min(spent, stage.seconds)
             self.progress.update(self._tasks[stage.name], completed=shown, note=note)
             if self.progress.disable and state != self._states[stage.name]:
-                line = f"{stage.name}: {note}; all is expected to end on {ends}"
+                line = f"{stage.name}: {note}" + ("" if done else f"; all is expected to end on {ends}")
                 self.progress.console.print(line, highlight=False, soft_wrap=True)
             self._states[stage.name] = state
 
