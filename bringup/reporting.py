@@ -9,9 +9,10 @@ from typing import Any, Self
 
 from bringup.command import Player
 from bringup.options import EpisodeOptions
-from bringup.results import EpisodeResult, report, summary, use_of_test_levels, write_report
+from bringup.results import EpisodeResult, report, summary
 from mujoban_core.bodies import get_body
 from mujoban_core.files import digest
+from mujoban_core.reports import use_of_test_levels, write_report
 from mujoban_core.signals import StopSignal
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import seed_range
@@ -89,7 +90,9 @@ class Reporting:
         if self._on_test_levels:
             from mujoban_rl.weights import provenance
 
-            content["test_uses"] = [use_of_test_levels(content, provenance()["commit"])]
+            seeds = [entry["seed"] for entry in content["episodes"]]
+            use = use_of_test_levels(provenance()["commit"], self._weights, (min(seeds), max(seeds)), content["played"])
+            content["test_uses"] = [use]
         print(*summary(content), sep="\n", flush=True)
         if self._path is not None:
             write_report(content, self._path)

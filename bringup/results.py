@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from pathlib import Path
 from typing import Any
 
-from mujoban_core.files import write_atomically
 from mujoban_core.plugins import PRIVILEGED, is_privileged
 from mujoban_core.stats import wilson_interval
 
@@ -116,30 +113,3 @@ def _brief(identity: str) -> str:
     """Return what plays a role for a line of which all are privileged: of a digest the first digits."""
     name = identity.removesuffix(PRIVILEGED)
     return f"weights {name[:_DIGITS]}" if re.fullmatch("[0-9a-f]{64}", name) else name
-
-
-def use_of_test_levels(content: Mapping[str, Any], commit: str | None) -> dict[str, Any]:
-    """Return the entry of a report's `test_uses` list: what was evaluated on test levels, on which, and how.
-
-    Args:
-        content: The report; where it does not say what was `played`, the entry has None.
-        commit: Of the code.
-    """
-    seeds = [entry["seed"] for entry in content["episodes"]]
-    where = {"seeds": [min(seeds), max(seeds)], "played": content.get("played")}
-    return {"commit": commit, "weights": content["weights"], **where}
-
-
-def write_report(content: Mapping[str, Any], path: Path) -> None:
-    """Write a report as JSON, whole or not at all; uses of the test range that the file lists are kept."""
-    if path.is_file() and "test_uses" in content:
-        content = {**content, "test_uses": [*_noted_uses(path), *content["test_uses"]]}
-    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
-
-
-def _noted_uses(path: Path) -> list[Any]:
-    try:
-        earlier = json.loads(path.read_text())
-    except json.JSONDecodeError:
-        return []
-    return list(earlier.get("test_uses", [])) if isinstance(earlier, dict) else []

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import errno
 import io
-import json
 import os
 import re
 import signal
@@ -25,7 +24,6 @@ from pathlib import Path
 from typing import Any, Final, NoReturn, TypeVar
 
 from mujoban_core.children import end_with_parent
-from mujoban_core.files import write_atomically
 from mujoban_core.signals import interrupt_status, interruptible, interruption, leave
 
 OptionsT = TypeVar("OptionsT")
@@ -150,15 +148,6 @@ def read_options(
         if leaving.code in (0, None):
             raise
         raise ValueError(_one_line(said.getvalue())) from None
-
-
-def give_report(report: Mapping[str, Any], file: Path | None) -> None:
-    """Print a report as JSON, or write it to a file if there is one."""
-    text = json.dumps(report, indent=2)
-    if file is None:
-        print(text)
-    else:
-        write_atomically(file, f"{text}\n".encode())
 
 
 _BOX: Final = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]")

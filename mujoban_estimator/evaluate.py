@@ -21,7 +21,8 @@ from torch import Tensor
 
 from mujoban_core.files import check_file
 from mujoban_core.interfaces import INSTRUCTION_LIMIT, renew_rows
-from mujoban_core.program import give_report, read_options, run_command
+from mujoban_core.program import read_options, run_command
+from mujoban_core.reports import give_report
 from mujoban_core.threads import set_threads
 from mujoban_estimator import SHIPPED, SHIPPED_TERMINATION, load, load_termination
 from mujoban_estimator.bag_stream import TOPICS, stretches

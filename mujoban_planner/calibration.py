@@ -25,7 +25,8 @@ import torch
 from numpy.typing import NDArray
 
 from mujoban_core.files import check_file
-from mujoban_core.program import give_report, read_options, run_command
+from mujoban_core.program import read_options, run_command
+from mujoban_core.reports import give_report
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.bag_lessons import Lessons
 from mujoban_planner.planner import LearnedPlanner

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.paper.runs import ROOT, SEED, Options, Run, is_stale
-from bringup.results import EpisodeResult, Failure, report, use_of_test_levels, write_report
+from bringup.results import EpisodeResult, Failure, report
+from mujoban_core.reports import use_of_test_levels, write_report
 
 PARTS: Final = ROOT / "runs" / "paper"
 """Where parts lie until their evaluation is whole."""
@@ -100,7 +101,11 @@ def _join(parts: list[Part]) -> dict[str, Any]:
     joined = report(episodes, json.loads(weights.pop()), **_common(parts[0].run, reports))
     # The parts are one use of the test levels together.
     commits = {use["commit"] for content in reports for use in content.get("test_uses", [])}
-    return {**joined, "test_uses": [use_of_test_levels(joined, ", ".join(sorted(map(str, commits))))]}
+    seeds = [episode.seed for episode in episodes]
+    use = use_of_test_levels(
+        ", ".join(sorted(map(str, commits))), joined["weights"], (min(seeds), max(seeds)), joined.get("played")
+    )
+    return {**joined, "test_uses": [use]}
 
 
 def _common(run: Run, reports: list[dict[str, Any]]) -> dict[str, Any]:

@@ -8,11 +8,12 @@ from benchmarks.paper import __main__ as results
 from benchmarks.paper import baselines, bodies, curves, figures, film, parts, runs, tables
 from bringup import train_all
 from bringup.command import Choice, Stack
-from bringup.results import EpisodeResult, report, write_report
+from bringup.results import EpisodeResult, report
 from mujoban_baselines.train import COMMANDS, PROG
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
 from mujoban_core.program import read_options
+from mujoban_core.reports import write_report
 from mujoban_planner import curves as planner_curves
 
 ORACLES = Stack({role: Choice(role, "oracle") for role in ROLES})

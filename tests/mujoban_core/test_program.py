@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from mujoban_core.program import exit_status, give_report, read_options
+from mujoban_core.program import exit_status, read_options
+from mujoban_core.reports import give_report
 
 PROGRAM = """
 from dataclasses import dataclass
