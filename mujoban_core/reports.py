@@ -28,11 +28,17 @@ def use_of_test_levels(
     return {"commit": commit, "weights": dict(weights), "seeds": list(seeds), "played": played}
 
 
-def write_report(content: Mapping[str, Any], path: Path) -> None:
-    """Write a report as JSON, whole or not at all; uses of the test range that the file lists are kept."""
+def write_report(content: Mapping[str, Any], path: Path, *, indent: int | None = 2) -> None:
+    """Write a report as JSON, whole or not at all; uses of the test range that the file lists are kept.
+
+    Args:
+        content: The report.
+        path: Its file.
+        indent: Of nested lines; None for a single line.
+    """
     if path.is_file() and "test_uses" in content:
         content = {**content, "test_uses": [*_noted_uses(path), *content["test_uses"]]}
-    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+    write_atomically(path, (json.dumps(content, indent=indent) + "\n").encode())
 
 
 def give_report(report: Mapping[str, Any], file: Path | None) -> None:

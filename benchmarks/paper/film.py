@@ -7,7 +7,6 @@ draws frames where it likes.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -24,12 +23,14 @@ from benchmarks.paper import runs
 from benchmarks.paper.runs import SEED, ResultError, read_source
 from bringup.command import Choice, Stack
 from bringup.rollout import ticks
-from mujoban_core.files import write_atomically
 from mujoban_core.grid import CONTROL_PERIOD, Instruction
 from mujoban_core.plugins import LEARNED, ROLES
+from mujoban_core.reports import use_of_test_levels, write_report
+from mujoban_rl.weights import provenance
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import seed_range
 
 NAME: Final = "film_strip"
 RERUN: Final = f"python -m benchmarks.paper.runs --only {NAME}"
@@ -69,7 +70,7 @@ def record(seed: int = SEED, difficulty: int = DIFFICULTY, stack: Stack | None =
             break
     else:
         raise ResultError(f"none of {len(episodes)} levels from seed {seed} on was solved: no film strip")
-    content = {
+    content: dict[str, Any] = {
         "seed": seed + first,
         "difficulty": difficulty,
         "body": stack.body,
@@ -79,7 +80,12 @@ def record(seed: int = SEED, difficulty: int = DIFFICULTY, stack: Stack | None =
         # The shortest decimals that give the same float32 again.
         "torque": [[float(str(value)) for value in values] for values in torque[first]],
     }
-    write_atomically(source(), (json.dumps(content) + "\n").encode())
+    if seed_range(seed, len(episodes)) == "test":
+        how = {name: content[name] for name in ("difficulty", "body", "world")}
+        seeds = seed, seed + len(episodes) - 1
+        use = use_of_test_levels(provenance()["commit"], content["weights"], seeds, {"program": RERUN, **how})
+        content["test_uses"] = [use]
+    write_report(content, source(), indent=None)
     print(f"{NAME}: solved the level of seed {seed + first} in {len(torque[first])} steps", flush=True)
 
 

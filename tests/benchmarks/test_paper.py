@@ -88,6 +88,8 @@ def test_a_damaged_source_is_named_with_the_command_that_mends_it(folder):
 def test_the_film_strip_plays_the_recorded_episode_again(folder):
     film.record(seed=1000, difficulty=1, stack=ORACLES)
     episode = film.load()
+    assert [(use["seeds"], use["weights"]) for use in episode["test_uses"]] == [([1000, 1007], episode["weights"])]
+    assert episode["body"] == "ball" and episode["world"]
     film.draw(episode, folder / "strip.png")
     assert (folder / "strip.png").stat().st_size > 10_000
     episode["torque"] = episode["torque"][: len(episode["torque"]) // 2]
