@@ -6,15 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.agent import Agent, AgentInput
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import BODIES
 from mujoban_core.interfaces import Memory, counter_uniform
 
 
 class RandomAgent(Agent):
-    """Draws every torque evenly from [-1, 1]; sees o_pr only to know how many robots there are."""
+    """Draws every torque evenly from [-1, 1]; sees o_pr only to know what robots, and how many, there are."""
 
     sees = ("proprio",)
-    config = {"body": BALL.name}  # noqa: RUF012 - as the networks declare it
 
     def initial_memory(self, batch: int) -> Memory:
         """Return seeds 0 and no draws yet, [B] each."""
@@ -25,8 +24,22 @@ class RandomAgent(Agent):
         return np.asarray(seeds, np.int64), np.zeros(len(seeds), np.int64)
 
     def step(self, inputs: AgentInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
-        """Return torques, [B, U], and the next state."""
+        """Return torques, [B, U], and the next state.
+
+        Raises:
+            ValueError: If no body has proprioception of that size.
+        """
         seed, drawn = state
-        size = BALL.action_size
+        assert inputs.proprio is not None
+        size = _actuators(inputs.proprio.shape[1])
         draws = [counter_uniform(seed, drawn + i) for i in range(size)]
         return np.stack([2.0 * d - 1.0 for d in draws], -1).astype(np.float32), (seed, drawn + size)
+
+
+def _actuators(felt: int) -> int:
+    """Return U of the body whose proprioception has so many values."""
+    for body in BODIES.values():
+        if body.proprio_size == felt:
+            return body.action_size
+    known = ", ".join(f"{body.proprio_size} ({body.name})" for body in BODIES.values())
+    raise ValueError(f"proprioception of {felt} values: expected {known}")

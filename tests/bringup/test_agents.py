@@ -11,7 +11,9 @@ from bringup.command import Choice, Solo
 from bringup.evaluate import evaluate, main
 from bringup.results import Failure
 from bringup.stack import PlayOptions, play
+from mujoban_baselines.random_agent import RandomAgent
 from mujoban_core.agent import Agent, AgentInput, AgentPolicy
+from mujoban_core.bodies import BODIES
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py.bags import open_bag
 from mujoban_sokoban.episodes import Episodes
@@ -102,9 +104,17 @@ class Eastward(Agent):
         return np.stack([roll, steer], -1).astype(np.float32), state
 
 
-def test_a_named_agent_is_evaluated_with_the_report_of_the_stack(tmp_path, capsys):
+class BallOnly(RandomAgent):
+    """Has learned nothing, but with one body."""
+
+    config = {"body": "ball"}  # noqa: RUF012 - as the networks declare it
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_a_named_agent_is_evaluated_with_the_report_of_the_stack(body, tmp_path, capsys):
     file = tmp_path / "report.json"
     played = ["--agent", "random", "--difficulty", "1", "--episodes", "3", "--time-limit", "20", "--json", str(file)]
+    played += ["--body", body]
     assert main(played) == 0
     assert '"agent": "random"' in file.read_text() and '"success_interval"' in file.read_text()
     assert "solved 0 of 3" in capsys.readouterr().out
@@ -116,7 +126,7 @@ def test_contradictions_and_unknown_agents_are_one_line():
     with pytest.raises(ValueError, match="no agent is named 'nobody'"):
         Solo(Choice.parse("agent", "nobody")).policy()
     with pytest.raises(ValueError, match="trained for the body ball"):
-        Solo(Choice.parse("agent", "random"), body="ant").policy()
+        Solo(Choice.parse("agent", f"{__name__}:BallOnly"), body="ant").policy()
     with pytest.raises(ValueError, match=r"expected a \.safetensors file"):
         Solo(Choice.parse("agent", "learned")).policy()
 
