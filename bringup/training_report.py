@@ -107,7 +107,10 @@ def cost(run: Path) -> dict[str, float]:
     Raises:
         PipelineError: If its record is damaged.
     """
-    pipeline = Pipeline.read(run)
+    return _cost(run, Pipeline.read(run))
+
+
+def _cost(run: Path, pipeline: Pipeline) -> dict[str, float]:
     spent = sum(entry.cpu_seconds for entry in pipeline.entries.values())
     return {"step": _steps(run), "cpu_seconds": round(spent), "seconds": round(pipeline.seconds())}
 
@@ -126,13 +129,13 @@ def _score(name: str, report: Mapping[str, Any]) -> Score:
 
 
 def _summary(run: Path, evaluations: Mapping[str, Mapping[str, Any]], pipeline: Pipeline) -> Iterator[str]:
-    spent = sum(entry.cpu_seconds for entry in pipeline.entries.values())
+    spent = _cost(run, pipeline)
     yield "# Weights from nothing"
     yield ""
     yield (
-        f"All stages together took {pipeline.seconds() / 3600:.2f} hours by the clock, some of them side by side on "
-        f"{pipeline.cores} cores, {spent / 3600:.2f} hours of the processor, and {readable(_steps(run))} environment "
-        "steps."
+        f"All stages together took {spent['seconds'] / 3600:.2f} hours by the clock, some of them side by side on "
+        f"{pipeline.cores} cores, {spent['cpu_seconds'] / 3600:.2f} hours of the processor, and "
+        f"{readable(spent['step'])} environment steps."
     )
     if not evaluations:
         return

@@ -26,9 +26,10 @@ from mujoban_controller.scripted import scripted_driver
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_file, digest
 from mujoban_core.program import read_options, run_command
-from mujoban_core.reports import give_report, use_of_test_levels
+from mujoban_core.reports import give_report
 from mujoban_core.threads import set_threads
-from mujoban_rl.weights import load_weights, provenance
+from mujoban_rl.sealed_levels import noted_use
+from mujoban_rl.weights import load_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range
@@ -94,11 +95,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
     told: dict[str, Any] = {
         "weights": {"controller": identity}, "world": options.world, "n": options.episodes, "seed": options.seed,
     }  # fmt: skip
-    if seed_range(options.seed, options.episodes) == "test":
-        how = {name: getattr(options, name) for name in ("driver", "instructions", "difficulty", "body", "world")}
-        seeds = options.seed, options.seed + options.episodes - 1
-        use = use_of_test_levels(provenance()["commit"], told["weights"], seeds, {"program": PROG, **how})
-        told["test_uses"] = [use]
+    how = {name: getattr(options, name) for name in ("driver", "instructions", "difficulty", "body", "world")}
+    told |= noted_use(options.seed, options.episodes, told["weights"], {"program": PROG, **how})
     give_report({**report, **told}, options.json)
     return 0
 

@@ -18,7 +18,7 @@ import numpy as np
 from mujoban_core.files import check_file, digest
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.program import read_options, run_command
-from mujoban_core.reports import give_report, use_of_test_levels
+from mujoban_core.reports import give_report
 from mujoban_core.stats import wilson_interval
 from mujoban_core.threads import set_threads
 from mujoban_planner import SHIPPED, load
@@ -28,7 +28,7 @@ from mujoban_planner.lookahead import LookAheadPlanner
 from mujoban_planner.option_checks import check_counts
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
-from mujoban_rl.weights import provenance
+from mujoban_rl.sealed_levels import noted_use
 from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_batch, seed_range
 from mujoban_sokoban.levels import LevelBatch, read_levels, stack_levels
 from mujoban_sokoban.solver import Status, solve_batch
@@ -141,11 +141,9 @@ def main(command_line: Sequence[str] | None = None) -> int:
     levels = options.level_batch()
     planner = load(options.weights, options.device)
     result = evaluate(planner, levels, options)
-    if options.levels is None and seed_range(options.seed, options.episodes) == "test":
+    if options.levels is None:
         how = {name: result[name] for name in ("difficulty", "thinking", "caution", "look_ahead")}
-        seeds = options.seed, options.seed + options.episodes - 1
-        use = use_of_test_levels(provenance()["commit"], result["weights"], seeds, {"program": PROG, **how})
-        result["test_uses"] = [use]
+        result |= noted_use(options.seed, options.episodes, result["weights"], {"program": PROG, **how})
     low, high = result["success_interval"]
     print(f"success rate          {result['success_rate']:.4f}  [{low:.4f}, {high:.4f}]  n = {result['n']}")
     if "moves_over_optimal" in result:

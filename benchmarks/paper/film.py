@@ -25,12 +25,11 @@ from bringup.command import Choice, Stack
 from bringup.rollout import ticks
 from mujoban_core.grid import CONTROL_PERIOD, Instruction
 from mujoban_core.plugins import LEARNED, ROLES
-from mujoban_core.reports import use_of_test_levels, write_report
-from mujoban_rl.weights import provenance
+from mujoban_core.reports import write_report
+from mujoban_rl.sealed_levels import noted_use
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
-from mujoban_sokoban.generator import seed_range
 
 NAME: Final = "film_strip"
 RERUN: Final = f"python -m benchmarks.paper.runs --only {NAME}"
@@ -80,11 +79,8 @@ def record(seed: int = SEED, difficulty: int = DIFFICULTY, stack: Stack | None =
         # The shortest decimals that give the same float32 again.
         "torque": [[float(str(value)) for value in values] for values in torque[first]],
     }
-    if seed_range(seed, len(episodes)) == "test":
-        how = {name: content[name] for name in ("difficulty", "body", "world")}
-        seeds = seed, seed + len(episodes) - 1
-        use = use_of_test_levels(provenance()["commit"], content["weights"], seeds, {"program": RERUN, **how})
-        content["test_uses"] = [use]
+    how = {name: content[name] for name in ("difficulty", "body", "world")}
+    content |= noted_use(seed, len(episodes), content["weights"], {"program": RERUN, **how})
     write_report(content, source(), indent=None)
     print(f"{NAME}: solved the level of seed {seed + first} in {len(torque[first])} steps", flush=True)
 
