@@ -1,7 +1,8 @@
 """Ticks per second of the learned stack: through the ROS graph in lockstep, and in one process without ROS.
 
 ``run`` measures both in turns, several times, so that what else the machine does hits them alike; the ratio is the
-median over the rounds. ``python -m benchmarks.graph`` prints it as JSON.
+median over the rounds. ``python -m benchmarks.graph`` prints it as JSON. With ``--realtime`` it is how long the graph
+takes to answer a tick of real time, without a search ahead and with one, in turns too.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import statistics
 import time
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 
@@ -18,6 +20,7 @@ from bringup.rollout import rollout
 from bringup.stack import PlayOptions, play
 from mujoban_core.plugins import ROLES
 from mujoban_core.sense_plan_act import SensePlanAct
+from mujoban_planner.deliberation import Deliberation
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
@@ -33,10 +36,15 @@ class Options:
     seed: int = 0
     oracle: tuple[str, ...] = ()
     """Roles that oracles play; none by default."""
+    realtime: float = 0.0
+    """Measure answers in real time at this speed, without and with a search ahead; 0: throughput in lockstep."""
+    look_ahead: int = 400
+    """Evaluations of that search."""
 
-    def stack(self) -> Stack:
+    def stack(self, look_ahead: int = 0) -> Stack:
         """Return the stack to measure."""
-        return Stack({role: Choice(role, "oracle" if role in self.oracle else "learned") for role in ROLES})
+        choices = {role: Choice(role, "oracle" if role in self.oracle else "learned") for role in ROLES}
+        return Stack(choices, deliberation=Deliberation(look_ahead=look_ahead))
 
 
 def _in_process(policy: SensePlanAct, episodes: Episodes, ticks: int) -> float:
@@ -67,5 +75,29 @@ def run(options: Options | None = None) -> dict[str, float]:
     }
 
 
+def answers(options: Options) -> dict[str, dict[str, float]]:
+    """Return how long answers take in real time, without a search ahead and with one.
+
+    Each: percentiles in milliseconds, medians over the rounds, and the share of ticks without a torque of their own.
+    """
+    torch.set_num_threads(1)
+    episodes = Episodes(1, options.seed, difficulty=options.difficulty)
+    play_options = PlayOptions(realtime=options.realtime, time_limit=options.ticks)
+    rounds: dict[str, list[dict[str, float]]] = {"alone": [], "looking_ahead": []}
+    for _ in range(options.rounds):
+        for name, evaluations in (("alone", 0), ("looking_ahead", options.look_ahead)):
+            outcome = play(options.stack(evaluations), episodes, play_options)
+            late = outcome.counts["simulator: late answers"] / outcome.results[0].steps
+            rounds[name].append({**outcome.answer_ms, "late": late})
+    return {
+        name: {key: statistics.median(one[key] for one in each) for key in each[0]} for name, each in rounds.items()
+    }
+
+
+def report(options: Options) -> dict[str, Any]:
+    """Return what was measured, and how."""
+    return {"options": asdict(options), **(answers(options) if options.realtime else run(options))}
+
+
 if __name__ == "__main__":
-    run_benchmark("benchmarks.graph", Options, lambda chosen: {"options": asdict(chosen), **run(chosen)})
+    run_benchmark("benchmarks.graph", Options, report)

@@ -125,7 +125,7 @@ class ModuleOptions:
     look_ahead: Annotated[int, whole("N", 0)] = 0
     """Let the learned planner search ahead by N evaluations of its network as the robot moves; 0 for none."""
     look_ahead_per_tick: Annotated[int, whole("N")] = PER_TICK
-    """Of them, in one tick."""
+    """Of them, in one tick; in real time as many as fit into a fifth of it."""
     look_ahead_certainty: float = CERTAINTY
     """Probability with which all must be as it seems that a plan of the search rests on."""
     thinking: Annotated[int, whole("K", 0)] = 0

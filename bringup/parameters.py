@@ -8,8 +8,10 @@ from typing import Any
 import yaml
 
 from bringup.command import Choice, Player, Solo
+from mujoban_core.grid import CONTROL_PERIOD
 from mujoban_core.look_around import LOOKING_ROLES
 from mujoban_core.plugins import AGENT, ROLES
+from mujoban_planner.deliberation import REALTIME_SHARE
 from mujoban_sokoban.episodes import Episodes
 
 DEFAULTS = Path(__file__).parent / "config" / "stack.yaml"
@@ -62,8 +64,10 @@ def graph_parameters(stack: Player, episodes: Episodes, *, run: int = 0, **simul
         return {"simulator": parameters["simulator"], AGENT: {"run": run, **_loaded(stack.choice, stack)}}
     for role in ROLES:
         parameters[role] |= {"run": run, **_loaded(stack.choices[role], stack)}
-    if simulator.get("realtime"):
+    deadline = 0.0
+    if speed := simulator.get("realtime"):
         parameters["termination"]["patience"] = 1
+        deadline = REALTIME_SHARE * CONTROL_PERIOD / speed
     for role in LOOKING_ROLES:
         parameters[role]["look_around"] = stack.look_around_ticks
     parameters["planner"] |= {
@@ -71,6 +75,7 @@ def graph_parameters(stack: Player, episodes: Episodes, *, run: int = 0, **simul
         "look_ahead": stack.deliberation.look_ahead,
         "look_ahead_per_tick": stack.deliberation.per_tick,
         "look_ahead_certainty": stack.deliberation.certainty,
+        "look_ahead_deadline": deadline,
         "scout": stack.scout.source,
         "scout_weights": "" if stack.scout.weights is None else str(stack.scout.weights),
     }

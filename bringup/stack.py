@@ -32,6 +32,7 @@ from mujoban_msgs_py.run_identifier import ANY, draw_run
 from mujoban_msgs_py.runtime.discovery import reaches_further
 from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
 from mujoban_msgs_py.runtime.tick_node import ros_context, spin
+from mujoban_sim.node import SimulatorNode
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.episodes import Episodes
 
@@ -77,10 +78,14 @@ class Outcome:
     ticks_per_second: float
     counts: Counter[str]
     """Events that a user should know of: of the nodes in this process, and how often others were started again."""
+    answer_ms: dict[str, float] = field(default_factory=dict[str, float])
+    """Milliseconds from the offer of a tick to its torque, percentiles of the latest ticks: p50, p99; none where the
+    simulator has a process of its own, whose /diagnostics tell."""
 
     def figures(self) -> dict[str, Any]:
         """Return the entries of a report that tell how the graph ran."""
-        return {"ticks_per_second": self.ticks_per_second, "counts": dict(self.counts)}
+        told: dict[str, Any] = {"ticks_per_second": self.ticks_per_second, "counts": dict(self.counts)}
+        return told | ({"answer_ms": self.answer_ms} if self.answer_ms else {})
 
 
 def play(
@@ -145,7 +150,14 @@ def play(
             on_refresh(monitor, monitor.results)
         _drain(graph.executor, listeners, monitor.stamp)
         counts = graph.counts() + (processes.counts() if options.processes else Counter())
-        return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts)
+        return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts, _answer_ms(graph))
+
+
+def _answer_ms(graph: InProcess) -> dict[str, float]:
+    simulator = graph.nodes.get("simulator")
+    if not isinstance(simulator, SimulatorNode):
+        return {}
+    return {f"p{percentile}": simulator.pace.answer_ms(percentile) for percentile in (50, 99)}
 
 
 def top_camera_size(player: Player, filmed: bool) -> int:

@@ -13,12 +13,16 @@ if TYPE_CHECKING:
 
 MOST_EVALUATIONS: Final = 10_000
 """Evaluations of a search ahead at most."""
+MOST_SECONDS: Final = 60.0
+"""Of a tick in which it may search."""
 MOST_THINKING: Final = 64
 """Repeats or views in one decision at most."""
 PER_TICK: Final = 2
 """Evaluations in a tick by default: 8 ms of the 50 ms between two ticks."""
 CERTAINTY: Final = 0.9
 """Probability by default with which all must be as it seems that a plan rests on."""
+REALTIME_SHARE: Final = 0.2
+"""Share of a tick's wall time in which it searches in real time, instead of by a number of evaluations."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,8 @@ class Deliberation:
     """Evaluations in one tick."""
     certainty: float = CERTAINTY
     """Probability with which all must be as it seems that a plan rests on."""
+    deadline: float = 0.0
+    """Seconds of a tick in which it searches, in the place of `per_tick`; 0 for none, as where time waits."""
 
     def __post_init__(self) -> None:
         """Reject numbers out of their range."""
@@ -42,6 +48,7 @@ class Deliberation:
             ("look_ahead", 0, MOST_EVALUATIONS),
             ("per_tick", 1, MOST_EVALUATIONS),
             ("certainty", 0.0, 1.0),
+            ("deadline", 0.0, MOST_SECONDS),
         ):
             if not least <= getattr(self, name) <= most:
                 raise ValueError(f"{name} is {getattr(self, name)}: expected {least} to {most}")
@@ -65,7 +72,9 @@ class Deliberation:
             module.thinking = self.thinking
         if not self.look_ahead:
             return module
-        return LookAheadPlanner(module, self.look_ahead, per_tick=self.per_tick, certainty=self.certainty)
+        return LookAheadPlanner(
+            module, self.look_ahead, per_tick=self.per_tick, certainty=self.certainty, deadline=self.deadline
+        )
 
     def settings(self) -> dict[str, int | float]:
         """Return what a report says of it."""

@@ -1,8 +1,9 @@
 """A planner that looks ahead: tree search guided by a learned planner, which it falls back on.
 
 Where no time passes it searches at once. On a robot it searches while the robot walks and waits: so many evaluations in
-every tick, so that an instruction is always there in time. A search is about the boxes and where the robot can walk to,
-so that it goes on while the robot walks; before a push, which cannot be taken back, the robot waits for its end.
+every tick, or as many as fit into so much of it, so that an instruction is always there in time. A search is about the
+boxes and where the robot can walk to, so that it goes on while the robot walks; before a push, which cannot be taken
+back, the robot waits for its end.
 
 Off by default everywhere; its results are reported on their own line.
 
@@ -52,6 +53,7 @@ class LookAheadPlanner(Planner):
         *,
         per_tick: int | None = None,
         certainty: float = CERTAINTY,
+        deadline: float = 0.0,
     ) -> None:
         """Look ahead by at most `expansions` evaluations of `planner` per search.
 
@@ -60,18 +62,21 @@ class LookAheadPlanner(Planner):
             expansions: Evaluations of a search.
             per_tick: Evaluations in a tick; None for as many as a search takes, before the next decision.
             certainty: Probability with which all must be as it seems that a plan rests on.
+            deadline: Seconds of a tick after which no further evaluation begins, in the place of `per_tick`; 0 for
+                none. How much is searched then depends on the machine.
 
         Raises:
             ValueError: If a number is out of its range.
         """
         super().__init__()
-        in_range = 1 <= expansions <= MOST_EVALUATIONS and (per_tick is None or per_tick >= 1)
+        in_range = 1 <= expansions <= MOST_EVALUATIONS and (per_tick is None or per_tick >= 1) and deadline >= 0.0
         if not in_range or not 0.0 <= certainty <= 1.0:
             raise ValueError(
-                f"look-ahead of {expansions} evaluations, {per_tick} in a tick, certainty {certainty}: expected 1 to "
-                f"{MOST_EVALUATIONS}, 1 at least, and a probability"
+                f"look-ahead of {expansions} evaluations, {per_tick} in a tick or {deadline} s of it, certainty "
+                f"{certainty}: expected 1 to {MOST_EVALUATIONS}, 1 at least, 0 at least, and a probability"
             )
         self.planner, self.expansions, self.per_tick, self.certainty = planner, expansions, per_tick, certainty
+        self.deadline = deadline
         self.thinks = per_tick is not None
         self._patience = 0 if per_tick is None else -(-expansions // per_tick)  # decisions that a search may take
         self.evaluations = 0
@@ -135,8 +140,11 @@ class LookAheadPlanner(Planner):
         return decision, (plan, cursor, expected, target, waits, searches, *visits, *means)
 
     def _advance(self, searches: NDArray[Any]) -> None:
-        steps = self.expansions if self.per_tick is None else self.per_tick
-        self.evaluations += advance([search for search in searches if search is not None], self.planner, steps)
+        going = [search for search in searches if search is not None]
+        if self.per_tick is not None and self.deadline:
+            self.evaluations += advance(going, self.planner, self.expansions, self.deadline)
+        else:
+            self.evaluations += advance(going, self.planner, self.per_tick or self.expansions)
 
     def _search(self, boards: BitBoards, rows: NDArray[np.int64], searches: NDArray[Any]) -> None:
         """Start searches for the states in `rows`, but where there is one, and go on with them."""

@@ -22,7 +22,14 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
-from mujoban_planner.deliberation import CERTAINTY, MOST_EVALUATIONS, MOST_THINKING, PER_TICK, Deliberation
+from mujoban_planner.deliberation import (
+    CERTAINTY,
+    MOST_EVALUATIONS,
+    MOST_SECONDS,
+    MOST_THINKING,
+    PER_TICK,
+    Deliberation,
+)
 
 
 class PlannerNode(ModuleNode[Planner]):
@@ -34,6 +41,8 @@ class PlannerNode(ModuleNode[Planner]):
             ticks; 0 for none. Fixed likewise.
         look_ahead_per_tick: Of them, in one tick. Fixed likewise.
         look_ahead_certainty: Probability with which all must be as it seems that a plan rests on. Fixed likewise.
+        look_ahead_deadline: Seconds of a tick in which it searches, in the place of `look_ahead_per_tick`; 0 for none,
+            as in lockstep. Fixed likewise.
         scout: What says where to look before pushing: scripted, learned or package.module:Class. Fixed likewise.
         scout_weights: Weights file of the learned one; empty means those that ship. Fixed likewise.
     """
@@ -64,11 +73,13 @@ class PlannerNode(ModuleNode[Planner]):
             return declare(self, name, default, described(about, fixed=True, low=low, high=high))
 
         certain = described("probability of what a plan rests on", fixed=True, low=0.0, high=1.0)
+        time = described("seconds of a tick for it instead; 0: by number", fixed=True, low=0.0, high=MOST_SECONDS)
         return Deliberation(
             number("thinking", 0, "thinking time of the network; 0: its own", 0, MOST_THINKING),
             number("look_ahead", 0, "evaluations of a search ahead; 0: none", 0, MOST_EVALUATIONS),
             number("look_ahead_per_tick", PER_TICK, "evaluations in a tick", 1, MOST_EVALUATIONS),
             declare(self, "look_ahead_certainty", CERTAINTY, certain),
+            declare(self, "look_ahead_deadline", 0.0, time),
         )
 
     @property

@@ -9,6 +9,8 @@ Boards are those of `mujoban_sokoban.bitboard`. Shapes: M levels, I = 8, T moves
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -104,12 +106,17 @@ class LoneSearch:
         return _instructions(self.forest, self.start._replace(agent=np.array([agent], np.uint8)), 0)
 
 
-def advance(searches: Sequence[LoneSearch], planner: LearnedPlanner, steps: int) -> int:
-    """Let searches take so many steps, as far as they are open; return the evaluations that this took."""
-    total = 0
-    for _ in range(steps):
+def advance(
+    searches: Sequence[LoneSearch], planner: LearnedPlanner, steps: int, seconds: float = math.inf
+) -> int:
+    """Let searches take so many steps, as far as they are open; return the evaluations that this took.
+
+    After `seconds` no further step begins; the first always does.
+    """
+    total, end = 0, time.perf_counter() + seconds
+    for step in range(steps):
         active = [search.forest for search in searches if search.open]
-        if not active:
+        if not active or (step > 0 and time.perf_counter() >= end):
             break
         popped = [forest.pop(_FIRST) for forest in active]
         columns = zip(*(boards for _, boards in popped), strict=True)

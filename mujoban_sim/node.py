@@ -38,7 +38,6 @@ from mujoban_sokoban.episodes import Episodes
 
 MATCH_PERIOD = 0.02
 """Seconds between two looks at whether the graph is complete."""
-
 LARGEST_PICTURE: Final = 4096
 """Most pixels along its edge."""
 _MOST: Final = 2**63 - 1
@@ -96,6 +95,7 @@ class SimulatorNode(GraphNode):
         counts: Events that a user should know of: late answers, rejected torques and so on.
         finished: Done when the last episode has ended.
         ticks: Steps of the world so far.
+        pace: The clock of real time, and how long answers take.
     """
 
     def __init__(self, **options: Unpack[NodeOptions]) -> None:
@@ -140,7 +140,7 @@ class SimulatorNode(GraphNode):
         self._resumed = self._restore()
         # What is missing to draw with shows now, and the first tick is as quick as the others.
         self.world.render()
-        self._pace = Pace(self._speed, self._settings["resend_after"], self._settings["hold_limit"], newest=self.run)
+        self.pace = Pace(self._speed, self._settings["resend_after"], self._settings["hold_limit"], newest=self.run)
         self._listen()
         report_on(self, self._condition)
         self._start_timer = self.create_timer(MATCH_PERIOD, self._start_when_complete)
@@ -232,6 +232,7 @@ class SimulatorNode(GraphNode):
         """Publish the tick and wait for what the modules make of it."""
         self._torque = self._instruction = None
         self._unconfirmed.update(self._witnesses)
+        self.pace.offer(self._stamp, time.perf_counter())
         self._publish()
 
     def _publish(self) -> None:
@@ -242,7 +243,7 @@ class SimulatorNode(GraphNode):
     def _offer_again(self) -> None:
         """Repeat a tick that stays without an answer: a node may have been started since."""
         waited = time.perf_counter() - self._offered > self._settings["resend_after"]
-        if waited and not (self._answered or self._over or self._pace.running):
+        if waited and not (self._answered or self._over or self.pace.running):
             self.counts["repeated ticks"] += 1
             self._publish()
 
@@ -273,13 +274,13 @@ class SimulatorNode(GraphNode):
         now = time.perf_counter()
         if self._over:
             return
-        if self._pace.falls_silent(now, answered=self._answered):
-            self._reject("waits of the clock", f"no torque for {self._pace.patience} s: the clock waits for one")
-        waits = self._pace.outruns(self._stamp) and not self._ended
-        if not (self._pace.running and (waits or self._may_step())):
-            self._pace.start(now)
+        if self.pace.falls_silent(now, answered=self._answered):
+            self._reject("waits of the clock", f"no torque for {self.pace.patience} s: the clock waits for one")
+        waits = self.pace.outruns(self._stamp) and not self._ended
+        if not (self.pace.running and (waits or self._may_step())):
+            self.pace.start(now)
             return
-        if (complaint := self._pace.complaint(now)) is not None:
+        if (complaint := self.pace.complaint(now)) is not None:
             self.get_logger().warning(complaint)
         if not waits:
             self._advance()
@@ -299,7 +300,7 @@ class SimulatorNode(GraphNode):
             self.world.instruct(np.array([self._in_force.direction]), np.array([issued]))
         self.world.step(self._held_torque[None])
         self.ticks += 1
-        self._pace.tick(late=self._torque is None)
+        self.pace.tick(late=self._torque is None)
         self._next()
 
     def _end(self) -> None:
@@ -322,7 +323,7 @@ class SimulatorNode(GraphNode):
     def _on_torque(self, message: Received) -> None:
         if not self._is_known(message.stamp, topics.TORQUE.name):
             return
-        self._pace.hear(message.stamp, time.perf_counter())
+        self.pace.hear(message.stamp, time.perf_counter())
         if message.stamp == self._stamp:
             self._torque = message.content
             self._proceed()
@@ -351,10 +352,11 @@ class SimulatorNode(GraphNode):
     def _condition(self) -> Condition:
         """Return what /diagnostics says of this node."""
         rate = self.ticks / self.seconds if self.seconds else 0.0
-        values = {"ticks": self.ticks, "ticks/s": f"{rate:.1f}", "episode": self._place.starts, **self.counts}
+        values = {"ticks": self.ticks, "ticks/s": f"{rate:.1f}", "answer ms, p99": f"{self.pace.answer_ms(99):.1f}"}
+        values |= {"episode": self._place.starts, **self.counts}
         if self._started is None:
             return Condition("waiting for the graph to be complete", values)
-        if not self._pace.kept:
+        if not self.pace.kept:
             return Condition("real time is not kept", values, warning=True)
         return Condition("paused" if self._paused else "running", values)
 

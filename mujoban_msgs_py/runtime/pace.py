@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from typing import Final
+
+import numpy as np
 
 from mujoban_core.grid import CONTROL_PERIOD
 from mujoban_msgs_py.topics import TICK
@@ -14,6 +17,8 @@ KEPT: Final = 0.95
 """Share of the wanted speed from which on real time counts as kept."""
 LATE: Final = 0.05
 """Share of late answers up to which it does."""
+REMEMBERED: Final = 10_000
+"""Answers whose times are kept."""
 
 
 @dataclass
@@ -36,6 +41,9 @@ class Pace:
     """In the window so far."""
     late: int = 0
     """Ticks of the window without a torque of their own."""
+    answer_times: deque[float] = field(default_factory=lambda: deque[float](maxlen=REMEMBERED))
+    """Seconds from the offer of a tick to its torque, of the latest ticks that got one."""
+    _offered: dict[int, float] = field(default_factory=dict[int, float])
     _since: float = 0.0
     _kept: bool = True
 
@@ -55,13 +63,24 @@ class Pace:
             return True
         return False
 
+    def offer(self, stamp: int, now: float) -> None:
+        """Note that the modules are given the tick of a stamp."""
+        self._offered[stamp] = now
+
     def hear(self, stamp: int, now: float) -> None:
         """Note an answer to the tick of a stamp."""
         self.newest, self.heard = max(self.newest, stamp), now
+        if (offered := self._offered.get(stamp)) is not None:
+            self.answer_times.append(now - offered)
+        self._offered = {other: at for other, at in self._offered.items() if other > stamp}
 
     def outruns(self, stamp: int) -> bool:
         """Tell whether the clock is too far ahead of the answers to go on from the tick of a stamp."""
         return stamp - self.newest > self.hold * TICK
+
+    def answer_ms(self, percentile: float) -> float:
+        """Return how long answers take, in milliseconds: a percentile of the latest ticks, 0 before any."""
+        return 1e3 * float(np.percentile(self.answer_times or [0.0], percentile))
 
     def start(self, now: float) -> None:
         """Begin a window, as after a pause; `now` in seconds of a clock that never jumps."""

@@ -13,6 +13,7 @@ from bringup.command import Choice, Stack
 from bringup.graph_recorder import RecorderNode
 from bringup.parameters import graph_parameters, write_parameters
 from mujoban_controller import teacher_weights
+from mujoban_planner.deliberation import Deliberation
 from mujoban_sim.node import PARAMETERS, SimulatorNode
 from mujoban_sokoban.episodes import Episodes
 
@@ -64,6 +65,15 @@ def test_weights_of_another_body_are_refused_by_a_node_when_it_starts_and_while_
     command = [sys.executable, "-m", "mujoban_controller.node", "--ros-args", "--params-file", tmp_path / "ant.yaml"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (2, f"error: {why}\n")
+
+
+@pytest.mark.parametrize(("speed", "seconds"), [(0.0, 0.0), (1.0, 0.01), (4.0, 0.0025)])
+def test_a_search_ahead_gets_a_fifth_of_a_tick_of_real_time_and_a_number_of_evaluations_where_time_waits(
+    play_graph, speed, seconds
+):
+    thinking = Stack(deliberation=Deliberation(look_ahead=50), look_around=0)
+    planner = play_graph(thinking, names=["planner"], realtime=speed).graph.nodes["planner"].module
+    assert planner.deadline == pytest.approx(seconds)
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,17 @@ def test_the_clock_runs_while_answers_come_to_whatever_tick_and_waits_for_an_ans
     assert pace.complaint(10.8) is None, "the time without a clock counts as time that was not kept"
 
 
+def test_how_long_answers_take_is_told_of_each_tick_once_also_of_those_that_come_late():
+    pace = Pace(1.0, patience=0.2, hold=2)
+    assert pace.answer_ms(99) == 0.0
+    for tick, offered, heard in ((1, 0.0, 0.01), (1, 0.0, 0.9), (2, 0.05, 0.08), (3, 0.1, None), (4, 0.15, 0.26)):
+        if heard != 0.9:  # a repeated answer to the first
+            pace.offer(tick * TICK, offered)
+        if heard is not None:
+            pace.hear(tick * TICK, heard)
+    assert [round(pace.answer_ms(percentile)) for percentile in (0, 50, 100)] == [10, 30, 110]
+
+
 def test_the_clock_goes_ahead_of_the_answers_by_as_many_ticks_as_a_torque_is_held():
     pace = Pace(1.0, patience=0.2, hold=2)
     pace.hear(10 * TICK, 0.0)

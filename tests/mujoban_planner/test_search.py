@@ -93,7 +93,7 @@ def test_a_search_spread_over_ticks_solves_what_it_solves_at_once_and_takes_no_m
     most = []
     monkeypatch.setattr(
         "mujoban_planner.lookahead.advance",
-        lambda searches, guide, steps: most.append(advance(searches, guide, steps)) or most[-1],
+        lambda searches, guide, *steps: most.append(advance(searches, guide, *steps)) or most[-1],
     )
     solved = 0
     for i in range(8):
@@ -102,6 +102,16 @@ def test_a_search_spread_over_ticks_solves_what_it_solves_at_once_and_takes_no_m
         solved += success
         assert len(decisions) <= 100
     assert solved >= 6 and max(most) == 2
+
+
+@pytest.mark.parametrize(("deadline", "in_a_tick"), [(1e-9, {1}), (60.0, range(20, 401)), (0.0, {7})])
+def test_in_real_time_a_tick_has_as_many_evaluations_as_fit_into_its_share_and_one_at_least(
+    planner, deadline, in_a_tick
+):
+    player = Deliberation(look_ahead=400, per_tick=7, deadline=deadline).prepare(planner)
+    states = abstract_states(take_levels(generate_batch(5, range(100, 101)), np.array([0])))
+    player.decide(states, player.initial_memory(1))
+    assert player.evaluations in in_a_tick
 
 
 def test_a_robot_that_looks_ahead_waits_before_a_push_until_the_search_has_ended(planner):
@@ -192,7 +202,7 @@ def test_thinking_time_reaches_the_network():
     assert network.thinking == network.views == 3
 
 
-@pytest.mark.parametrize("name", ["thinking", "look_ahead", "per_tick", "certainty"])
+@pytest.mark.parametrize("name", ["thinking", "look_ahead", "per_tick", "certainty", "deadline"])
 def test_no_thinking_time_out_of_its_range(name):
     with pytest.raises(ValueError, match=f"{name} is -1: expected "):
         Deliberation(**{name: -1})
