@@ -1,6 +1,6 @@
 """Train a policy with Stable-Baselines3 on `Mujoban-v0`: `python examples/train_with_a_library.py [STEPS]`.
 
-Needs `pip install stable-baselines3`. The library's PPO sees the robot's proprioception, its pose and the abstract
+Needs `pip install 'mujoban[examples]'`. The library's PPO sees the robot's proprioception, its pose and the abstract
 state, since a camera policy takes days; `observations="default"` and "CnnPolicy" would be the task itself. The weights
 are written to `ppo_mujoban.zip`; examples/evaluate_beside_the_stack.py shows how to evaluate a policy of your own.
 """
@@ -22,8 +22,8 @@ def make() -> gymnasium.Env:
 
 def main(steps: int) -> None:
     """Train for a number of environment steps and say what an episode brings."""
-    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
-    from stable_baselines3.common.evaluation import evaluate_policy  # pyright: ignore[reportMissingImports]
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.evaluation import evaluate_policy
 
     model = PPO("MlpPolicy", make(), n_steps=min(2048, steps), seed=0, verbose=1)
     model.learn(steps)

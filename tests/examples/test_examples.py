@@ -1,6 +1,5 @@
 """Every example runs as it is printed."""
 
-import importlib.util
 import runpy
 import sys
 from contextlib import suppress
@@ -35,8 +34,6 @@ def run(monkeypatch, capsys, tmp_path):
 
 
 def test_a_policy_is_trained_with_a_well_known_library(run):
-    if importlib.util.find_spec("stable_baselines3") is None:
-        pytest.skip("stable-baselines3 is not installed, and not needed by anything else")
     assert "over 2 episodes" in run("train_with_a_library.py", 8)
 
 
