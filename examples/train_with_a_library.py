@@ -22,13 +22,17 @@ def make() -> gymnasium.Env:
 
 def main(steps: int) -> None:
     """Train for a number of environment steps and say what an episode brings."""
+    import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.monitor import Monitor
 
-    model = PPO("MlpPolicy", make(), n_steps=min(2048, steps), seed=0, verbose=1)
+    torch.set_num_threads(1)  # so small a network gains nothing by more, and on a busy machine they wait for each other
+    env = Monitor(make())
+    model = PPO("MlpPolicy", env, n_steps=min(2048, steps), seed=0, verbose=1)
     model.learn(steps)
     model.save("ppo_mujoban")
-    mean, deviation = evaluate_policy(model, make(), n_eval_episodes=2)
+    mean, deviation = evaluate_policy(model, env, n_eval_episodes=2)
     print(f"return {mean:.2f} +- {deviation:.2f} over 2 episodes")
 
 
