@@ -1,0 +1,71 @@
+"""A body that only a description makes is recorded, sensed, driven by camera and played, as the two that ship are."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from cart import CART
+from gymnasium.utils.env_checker import check_env
+
+import mujoban_sim  # noqa: F401 - registers the environment
+from bringup.command import Choice, Stack
+from bringup.exploration import Disturbance
+from bringup.record import Job, MixedEpisodes, record
+from mujoban_controller.distil import DistilConfig
+from mujoban_controller.goal_settings import GoalTaskConfig
+from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_controller.train import NetworkConfig
+from mujoban_controller.train import Options as ControllerOptions
+from mujoban_controller.train import TrainConfig as ControllerConfig
+from mujoban_controller.train import make_trainer as controller_trainer
+from mujoban_core.bodies import BODIES
+from mujoban_estimator.estimator import EstimatorConfig
+from mujoban_estimator.learner import LearnerConfig, TrainConfig
+from mujoban_estimator.termination import TerminationConfig
+from mujoban_estimator.train import Options, make_trainer
+from mujoban_rl.weights import save_weights
+from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import TRAIN_SEEDS
+
+
+@pytest.fixture
+def teacher(monkeypatch, tmp_path):
+    """Make the cart a body, and return weights of an untrained teacher of it."""
+    monkeypatch.setitem(BODIES, "cart", CART)
+    torch.manual_seed(0)
+    policy = PrivilegedPolicy("cart")
+    save_weights(tmp_path / "teacher.safetensors", policy, policy.config, {})
+    return tmp_path / "teacher.safetensors"
+
+
+def test_libraries_take_its_environment(teacher):
+    env = gymnasium.make("Mujoban-v0", difficulty=1, body="cart", time_limit=20)
+    check_env(env.unwrapped, skip_render_check=True)
+    assert env.action_space.shape == (2,)
+
+
+def test_its_senses_and_its_camera_policy_are_trained_and_play_in_the_graph(teacher, oracles, play_graph, tmp_path):
+    driven = Stack(oracles.choices | {"controller": Choice("controller", weights=teacher)}, body="cart")
+    episodes = MixedEpisodes(2, TRAIN_SEEDS.start, [1])
+    assert record(Job(tmp_path / "bags", "", episodes, driven, Disturbance(), 2, 40, 0)) == 80
+    senses = LearnerConfig(EstimatorConfig(body="cart"), TerminationConfig(body="cart"))
+    sensed = TrainConfig(senses, steps=2, streams=2, length=16)
+    options = Options((tmp_path / "bags",), tmp_path / "senses", out=tmp_path / "out", config=sensed, workers=0)
+    make_trainer(options).run()
+    task = GoalTaskConfig(batch=4, body="cart", difficulty=1)
+    config = ControllerConfig(
+        stage="distil", teacher=teacher, task=task, network=NetworkConfig((8, 8), 16, 16), steps=256,
+        distil=DistilConfig(windows=4, first=64),
+    )  # fmt: skip
+    controller_trainer(ControllerOptions(tmp_path / "student", config, evaluation_episodes=0)).run()
+    learned = {
+        "estimator": Choice("estimator", weights=tmp_path / "out/estimator.safetensors"),
+        "termination": Choice("termination", weights=tmp_path / "out/termination.safetensors"),
+        "controller": Choice("controller", weights=tmp_path / "student/controller.safetensors"),
+    }
+    graph = play_graph(Stack(oracles.choices | learned, body="cart"), Episodes(1, 0, difficulty=1), time_limit=30)
+    (result,) = graph.finish()
+    torques = np.array(list(graph.said.torque.values()))
+    assert result.steps == len(torques) == 30 and torques.shape[1] == 2 and np.abs(torques).max() > 0
