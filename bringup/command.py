@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mujoban_core.bodies import BALL, get_body
-from mujoban_core.look_around import LOOK_AROUND_TICKS, look_around
+from mujoban_core.look_around import look_around
 from mujoban_core.plugins import (
     AGENT,
     LEARNED,
@@ -87,8 +87,8 @@ class Stack:
     choices: dict[str, Choice] = field(default_factory=lambda: {role: Choice(role) for role in ROLES})
     device: str = "cpu"
     look_around: int | None = None
-    """Ticks of looking around at the start of an episode; None: `LOOK_AROUND_TICKS`, or 0 for the oracle estimator and
-    for a body that cannot turn on the spot."""
+    """Ticks of looking around at the start of an episode; None: the body's `look_ticks`, or 0 for the oracle
+    estimator."""
     deliberation: Deliberation = field(default_factory=Deliberation)
     """How long the planner thinks."""
     threads: int = 1
@@ -104,8 +104,7 @@ class Stack:
         """Ticks of looking around at the start of an episode."""
         if self.look_around is not None:
             return self.look_around
-        blind = self.choices["estimator"].source != ORACLE
-        return LOOK_AROUND_TICKS if blind and get_body(self.body).turn is not None else 0
+        return 0 if self.choices["estimator"].source == ORACLE else get_body(self.body).look_ticks
 
     def policy(self) -> SensePlanAct:
         """Return the modules composed into one policy.

@@ -2,7 +2,9 @@
 
 Irreversible pushes into the unknown are the first cause of failure under partial observation (paper, section 4). Two
 wrappers make any planner and any controller look around: the planner tells the robot to stay where it wants a look, or
-to walk to such a place, and the controller turns on the spot when it is told to stay. Neither pushes a box for it.
+to walk to such a place, and the controller turns on the spot when it is told to stay. Neither pushes a box for it. A
+body that no single action turns has a controller that has learned to turn when it is told to stay, and needs the first
+alone.
 
 Shapes: B robots, M of them with a decision to take, V viewpoints, N = `grid.GRID_SIZE`, U actuators.
 """
@@ -31,8 +33,6 @@ from mujoban_core.interfaces import (
 )
 from mujoban_core.visibility import cells_in_view
 
-LOOK_AROUND_TICKS: Final = 40
-"""Ticks in which the ball turns once; what a learned estimator gets by default."""
 LOOKING_ROLES: Final = ("planner", "controller")
 """The roles that `look_around` wraps."""
 WALKS: Final = 30
@@ -70,9 +70,13 @@ class Scout(ABC):
 class ScriptedScout(Scout):
     """Walks to where a turn shows most that is unknown, by a rule."""
 
+    def __init__(self, body: Body = BALL) -> None:
+        """Say where the camera of a body sees most."""
+        self.body = body
+
     def step(self, abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> Instruction | None:
         """Return the first step of the way there, STAY if it is here, None if no place is worth the way."""
-        return step_to_view(abstract_state, shown)
+        return step_to_view(abstract_state, shown, self.body)
 
 
 class LookAroundPlanner(Planner):
@@ -82,7 +86,9 @@ class LookAroundPlanner(Planner):
     [B]; the instructions left for looking, int64 [B]; the cells that looks have shown, bool [B, N, N].
     """
 
-    def __init__(self, inner: Planner, ticks: int, walks: int = WALKS, scout: Scout | None = None) -> None:
+    def __init__(
+        self, inner: Planner, ticks: int, walks: int = WALKS, scout: Scout | None = None, body: Body = BALL
+    ) -> None:
         """Wrap a planner.
 
         Args:
@@ -90,15 +96,16 @@ class LookAroundPlanner(Planner):
             ticks: Of a look.
             walks: Instructions that looks after the first and the way there take at most.
             scout: Says where to look; by default by a rule.
+            body: Carries the camera.
         """
-        self.inner, self.ticks, self.walks = inner, ticks, walks
-        self.scout = scout or ScriptedScout()
+        self.inner, self.ticks, self.walks, self.body = inner, ticks, walks, body
+        self.scout = scout or ScriptedScout(body)
         self.privileged = inner.privileged
         self.thinks = inner.thinks
 
     def for_planner(self, inner: Planner) -> LookAroundPlanner:
         """Return what makes another planner look around like this one."""
-        return LookAroundPlanner(inner, self.ticks, self.walks, self.scout)
+        return LookAroundPlanner(inner, self.ticks, self.walks, self.scout, self.body)
 
     def initial_memory(self, batch: int) -> Memory:
         """Return the memory at the start of `batch` episodes, each of which begins with a look."""
@@ -116,7 +123,7 @@ class LookAroundPlanner(Planner):
         ready = np.zeros(len(tick), np.bool_)
         for i in np.flatnonzero(tick >= until):
             if until[i] > 0:  # A look has just ended: what it did not make certain will not become so from here
-                seen[i] |= turn_view(abstract_state[i])
+                seen[i] |= turn_view(abstract_state[i], self.body)
                 until[i] = 0
             step = None if walks[i] == 0 else self.scout.step(abstract_state[i], seen[i])
             if step is None:
@@ -169,28 +176,32 @@ def look_around(
 ) -> AnyModule | LookAroundPlanner | LookAroundController:
     """Return a planner or controller that looks around, `ticks` a look; 0, or another module: itself.
 
+    So is the controller of a body that no single action turns: whether it turns is for it to learn.
+
     Raises:
-        ValueError: If `ticks` is negative, or the body has no action that turns it on the spot.
+        ValueError: If `ticks` is negative.
     """
     if ticks < 0:
         raise ValueError(f"look_around {ticks}: expected a number of ticks, 0 for none")
     if ticks == 0:
         return module
-    if body.turn is None:
-        raise ValueError(f"look_around {ticks}: the {body.name} has no action that turns it on the spot; expected 0")
     if isinstance(module, Planner):
-        return LookAroundPlanner(module, ticks, scout=scout)
-    if isinstance(module, Controller):
+        by_rule = scout is None or isinstance(scout, ScriptedScout)
+        return LookAroundPlanner(module, ticks, scout=ScriptedScout(body) if by_rule else scout, body=body)
+    if isinstance(module, Controller) and body.turn is not None:
         return LookAroundController(module, body.turn)
     return module
 
 
-def step_to_view(abstract_state: NDArray[np.float32], seen: NDArray[np.bool_]) -> Instruction | None:
+def step_to_view(
+    abstract_state: NDArray[np.float32], seen: NDArray[np.bool_], body: Body = BALL
+) -> Instruction | None:
     """Return the first step to where a turn shows most that is unknown; STAY for here, None if nowhere does.
 
     Args:
         abstract_state: Estimate, [N, N, 4].
         seen: Cells that looks have shown, [N, N].
+        body: Carries the camera.
     """
     wall = abstract_state[..., WALL]
     unknown = (wall > _UNCERTAIN[0]) & (wall < _UNCERTAIN[1]) & ~seen
@@ -199,26 +210,27 @@ def step_to_view(abstract_state: NDArray[np.float32], seen: NDArray[np.bool_]) -
         return None
     distance, first = _walks(abstract_state)
     cells = np.flatnonzero(distance >= 0)
-    gain = (_views(wall, cells) & unknown.ravel()).sum(1)
+    gain = (_views(wall, cells, body) & unknown.ravel()).sum(1)
     worth = np.where(gain >= MIN_GAIN, gain - _WALK_COST * distance[cells], -np.inf)
     best = int(np.argmax(worth))
     return Instruction(int(first[cells[best]])) if np.isfinite(worth[best]) else None
 
 
-def turn_view(abstract_state: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which cells a turn in the robot's cell shows, by an estimate, [N, N] from [N, N, 4]."""
+def turn_view(abstract_state: NDArray[np.float32], body: Body = BALL) -> NDArray[np.bool_]:
+    """Return which cells a turn in the robot's cell shows a body, by an estimate, [N, N] from [N, N, 4]."""
     here = np.argmax(abstract_state[..., AGENT])
-    return _views(abstract_state[..., WALL], np.array([here])).reshape(GRID_SIZE, GRID_SIZE)
+    return _views(abstract_state[..., WALL], np.array([here]), body).reshape(GRID_SIZE, GRID_SIZE)
 
 
-def _views(wall: NDArray[np.float32], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _views(wall: NDArray[np.float32], cells: NDArray[np.int64], body: Body) -> NDArray[np.bool_]:
     """Return which cells a turn in each of `cells`, [V], shows, [V, N * N]."""
     half = (GRID_SIZE - 1) / 2
-    x, y = cells % GRID_SIZE - half, half - cells // GRID_SIZE
+    x, y = body.cell_size * (cells % GRID_SIZE - half), body.cell_size * (half - cells // GRID_SIZE)
     turns = len(TURN_HEADINGS)
     pose = np.stack([np.repeat(x, turns), np.repeat(y, turns), np.tile(TURN_HEADINGS, len(cells))], -1)
     opaque = np.broadcast_to(wall > _OPAQUE, (len(pose), GRID_SIZE, GRID_SIZE))
-    return np.any(cells_in_view(opaque, pose, BALL.camera).reshape(len(cells), turns, _CELLS), axis=1)
+    view = cells_in_view(opaque, pose, body.camera, body.cell_size)
+    return np.any(view.reshape(len(cells), turns, _CELLS), axis=1)
 
 
 def _walks(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mujoban_controller.mpo import MPOTrainingConfig
+from mujoban_core.bodies import BALL
 from mujoban_core.files import digest
-from mujoban_core.look_around import LOOK_AROUND_TICKS
 from mujoban_core.plugins import ROLES, shipped_weights
 from mujoban_planner.discrete_mpo import MPOSettings
 
@@ -60,7 +60,7 @@ class PlannerSettings:
 class JointSettings:
     """How the stack plays, and how planner and controller learn from it."""
 
-    look_around: int = LOOK_AROUND_TICKS
+    look_around: int = BALL.look_ticks
     """Ticks of a turn on the spot while the map is uncertain, 0 for none; in such turns nobody learns to drive."""
     controller: MPOTrainingConfig = field(
         default_factory=lambda: MPOTrainingConfig(

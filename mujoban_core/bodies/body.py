@@ -193,6 +193,7 @@ class Body:
             `RobotPhysics` stand in braces, for `fragment` to fill in.
         turn: the action, U values in [-1, 1], that turns it to its left on the spot; None where no single one does, and
             its controller learns to turn while it is told to stay.
+        look_ticks: ticks in which it turns once; 0 where it does not, and then it does not look around by default.
     """
 
     name: str
@@ -209,6 +210,7 @@ class Body:
     camera: CameraMount
     mjcf: str
     turn: tuple[float, ...] | None = None
+    look_ticks: int = 0
 
     @property
     def action_size(self) -> int:

@@ -28,6 +28,8 @@ from mujoban_msgs_py.topics import Topic
 
 MOST_TICKS = 1_000_000
 """Upper end of ranges of ticks, which have none of their own."""
+OWN_LOOK = -1
+"""Stands for the ticks of a look that are the body's own."""
 _PLACE, _ANSWER, _LEAF = "place", "answer", "state."
 """Keys of what a node keeps: the number of the episode and the stamp of the tick; its answer; arrays of the state."""
 TRUTH_INPUTS = (
@@ -57,8 +59,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
             busy one they wait for each other. Fixed when the node starts.
         run: Identifier of the run that the module answers; -1 for any. Fixed when the node starts.
         run_seed: Seed of the module's random streams, one for each number of an episode; fixed when the node starts.
-        look_around: Of planner and controller alone: ticks of a look, which is a turn on the spot; 0 for none. Fixed
-            when the node starts.
+        look_around: Of planner and controller alone: ticks of a look, which is a turn on the spot; 0 for none, -1 for
+            those of the body. Fixed when the node starts.
         resume_file: Where the node keeps what it remembers after every tick, so that it goes on from there after it was
             killed; empty means nowhere. Fixed when the node starts.
     """
@@ -87,7 +89,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         self._run_seed = declare(self, "run_seed", 0, seeds)
         self._look_around = 0
         if self.role in LOOKING_ROLES:
-            look = described("ticks of a look, a turn on the spot; 0: none", fixed=True, low=0, high=MOST_TICKS)
+            about = "ticks of a look, a turn on the spot; 0: none, -1: those of the body"
+            look = described(about, fixed=True, low=OWN_LOOK, high=MOST_TICKS)
             self._look_around = declare(self, "look_around", 0, look)
         self.module = self._load(weights, device)
         self.state: Any = None
@@ -157,7 +160,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
             check_body(self.role, module, self._body)
         # `load_module` has checked that it is of the role.
         body = get_body(self._body) if self._body else BALL
-        return cast(ModuleT, look_around(self.prepare(module), self._look_around, self.scout, body))
+        ticks = body.look_ticks if self._look_around == OWN_LOOK else self._look_around
+        return cast(ModuleT, look_around(self.prepare(module), ticks, self.scout, body))
 
     @property
     def scout(self) -> Scout | None:

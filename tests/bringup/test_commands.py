@@ -387,8 +387,9 @@ def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capf
     assert run(run_stack, "--headless", *few, *oracles) == 2
     error = capfd.readouterr().err.splitlines()[-1]
     assert error.endswith("the controller was trained for the body ball: expected weights for ant, or an oracle")
-    assert run(run_stack, "--headless", *few, *oracles, "--look-around", 5) == 2
-    assert capfd.readouterr().err.splitlines()[-1].endswith("has no action that turns it on the spot; expected 0")
+    looking = [*few, *oracles, "--controller", ant_teacher, "--look-around", 5, "--json", report]
+    assert run(run_stack, "--headless", *looking) == 0
+    assert json.loads(report.read_text())["played"]["look_around"] == 5
 
 
 def test_levels_that_are_not_for_training_are_recorded_only_when_that_is_asked_for():

@@ -10,7 +10,12 @@ from types import ModuleType
 
 import pytest
 
-from mujoban_core.look_around import LOOK_AROUND_TICKS
+from bringup.command import Stack
+from bringup.parameters import graph_parameters
+from mujoban_core.bodies import BALL
+from mujoban_msgs_py.runtime.module_node import OWN_LOOK
+from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sokoban.episodes import Episodes
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "bringup" / "ros_package"
@@ -82,7 +87,7 @@ def launched(monkeypatch):
 
 @pytest.mark.parametrize(
     ("arguments", "ticks"),
-    [({}, LOOK_AROUND_TICKS), ({"module": "oracle"}, 0), ({"module": "oracle", "look_around": "8"}, 8)],
+    [({}, OWN_LOOK), ({"module": "oracle"}, 0), ({"module": "oracle", "look_around": "8"}, 8)],
 )
 def test_launched_oracles_do_not_look_around(launched, arguments, ticks):
     nodes = launched(**arguments)
@@ -91,3 +96,21 @@ def test_launched_oracles_do_not_look_around(launched, arguments, ticks):
         assert f"look_around:={ticks}" in nodes[name]
     assert "look_around" not in " ".join(nodes["mujoban_estimator.node"])
     assert "patience:=1" in nodes["mujoban_estimator.termination_node"]
+
+
+def test_the_launch_file_and_run_stack_have_the_same_defaults(launched):
+    nodes = launched()
+    simulator, planner = nodes["mujoban_sim.node"], nodes["mujoban_planner.node"]
+    assert f"world:={DEFAULT_WORLD}" in simulator and f"body:={BALL.name}" in simulator
+    usual = graph_parameters(Stack(), Episodes(1, 0), realtime=1.0)["planner"]
+    (deadline,) = (float(word.partition(":=")[2]) for word in planner if word.startswith("look_ahead_deadline"))
+    assert deadline == pytest.approx(usual["look_ahead_deadline"]) and "look_ahead:=0" in planner
+
+
+def test_another_body_world_and_weights_are_launched_for_every_node(launched):
+    nodes = launched(body="ant", world="reference", weights="/trained", realtime="0.0", look_ahead="400")
+    assert all("body:=ant" in command for command in nodes.values())
+    assert all("world:=reference" in nodes[name] for name in ("mujoban_sim.node", "bringup.viz"))
+    assert "weights:='/trained/controller.safetensors'" in nodes["mujoban_controller.node"]
+    assert {"look_ahead:=400", "look_ahead_deadline:=0.0"} <= set(nodes["mujoban_planner.node"])
+    assert "weights:=''" in launched()["mujoban_planner.node"]

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from bringup.command import Stack
+from bringup.command import Choice, Stack
 from bringup.rollout import ticks
-from mujoban_core.bodies import ANT
+from mujoban_core.bodies import ANT, BALL, BODIES
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
-from mujoban_core.look_around import LOOK_AROUND_TICKS, LookAroundPlanner, look_around, step_to_view
+from mujoban_core.look_around import LookAroundPlanner, look_around, step_to_view
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.world import World
@@ -31,7 +31,7 @@ ROOM = ("########", "#@  ####", "#   ####", "## #####", "## ?????", "## ?????", 
 
 def test_the_robot_turns_once_on_the_spot_then_solves_the_level_as_ever():
     parts = (OracleEstimator(), OracleTermination(), OraclePlanner(), OracleController())
-    policy = SensePlanAct(*(look_around(part, LOOK_AROUND_TICKS) for part in parts))  # pyright: ignore
+    policy = SensePlanAct(*(look_around(part, BALL.look_ticks) for part in parts))  # pyright: ignore
     headings, places, instructions = [], [], []
     solved = False
     for tick in ticks(policy, World(1), Episodes(1, 7, difficulty=1)):
@@ -39,7 +39,7 @@ def test_the_robot_turns_once_on_the_spot_then_solves_the_level_as_ever():
         places.append(tick.observation.pose[0, :2])
         instructions.append(int(tick.decision.instruction[0]))
         solved |= bool(tick.solved[0])
-    looking = LOOK_AROUND_TICKS
+    looking = BALL.look_ticks
     assert not any(instructions[:looking]) and any(instructions[looking : looking + 3])
     turned = np.abs(np.unwrap(headings[:looking])[-1] - headings[0])
     assert turned > 0.9 * 2 * np.pi
@@ -86,11 +86,22 @@ def test_looks_come_to_an_end():
     assert now.memory[-2][0] == 0
 
 
-def test_a_body_that_cannot_turn_on_the_spot_is_refused_and_does_not_look_around_by_default():
-    for part in (OraclePlanner(), OracleController()):
-        with pytest.raises(ValueError, match="the ant has no action that turns it on the spot; expected 0"):
-            look_around(part, 40, body=ANT)
-    assert (Stack(body="ant").look_around_ticks, Stack().look_around_ticks) == (0, LOOK_AROUND_TICKS)
+def test_a_body_that_no_single_action_turns_is_told_to_stay_and_its_controller_has_to_turn_it():
+    controller = OracleController()
+    assert look_around(controller, 30, body=ANT) is controller
+    planner = look_around(OraclePlanner(), 30, body=ANT)
+    now, instructions = planner.initial_state(np.zeros(1, np.int64)), []
+    for _ in range(32):
+        instruction, now = planner.step(estimate(*ROOM)[None], np.array([True]), now)
+        instructions.append(int(instruction[0]))
+    assert not any(instructions[:30]) and any(instructions[30:])
+
+
+def test_each_body_looks_around_for_as_long_as_it_takes_to_turn():
+    assert [Stack(body=body.name).look_around_ticks for body in BODIES.values()] == [
+        body.look_ticks for body in BODIES.values()
+    ]
+    assert Stack({"estimator": Choice("estimator", "oracle")}).look_around_ticks == 0
 
 
 def test_a_negative_time_is_refused():
