@@ -23,6 +23,7 @@ from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_planner.deliberation import Deliberation
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import VALIDATION_SEEDS
 
 
 @dataclass
@@ -33,7 +34,7 @@ class Options:
     """Of each contestant in a round."""
     rounds: int = 32
     difficulty: int = 5
-    seed: int = 0
+    seed: int = VALIDATION_SEEDS.start
     oracle: tuple[str, ...] = ()
     """Roles that oracles play; none by default."""
     realtime: float = 0.0

@@ -24,6 +24,7 @@ from mujoban_core.stats import wilson_interval
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import VALIDATION_SEEDS
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Options:
 
     levels: int = 512
     difficulty: int = 5
-    seed: int = 1000
+    seed: int = VALIDATION_SEEDS.start
     batch: int = 64
     threads: int = 2
     physics: Annotated[WorldOptions, arg(name="")] = field(default_factory=WorldOptions)
