@@ -23,12 +23,11 @@ from mujoban_planner.teacher import STEP_REWARD, reachable_pushes
 from mujoban_rl.engine import State
 from mujoban_sokoban.bitboard import NONE, SQUARE_STEP, SQUARES, bit, flood, pushable, pushed
 from mujoban_sokoban.rules import BOX_REWARD, SOLVED_REWARD
-from mujoban_sokoban.solver_labels import walk_distances
+from mujoban_sokoban.solver_labels import UNREACHED, walk_distances
 from mujoban_sokoban.solver_search import dead_squares, push_distances
 
 PUSHES: Final = 4 * SQUARES
 """Pushes that a state may have."""
-_UNREACHED: Final = 127
 
 
 class PushStep(NamedTuple):
@@ -151,7 +150,7 @@ def _step(
             return i
         walk_distances(agent[i], free, distance)
         walk = np.int64(distance[square - SQUARE_STEP[direction]])
-        if walk == _UNREACHED:
+        if walk == UNREACHED:
             return i
         moves[i] = min(walk + 1, limit - total[i])
         total[i] += moves[i]

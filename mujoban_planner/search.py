@@ -25,6 +25,7 @@ from mujoban_planner.forest import Forest
 from mujoban_planner.forest_kernels import region_of
 from mujoban_planner.heads import verdicts
 from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.shortening import shorten
 from mujoban_sokoban.solver_labels import moves_of
 
 _FIRST: Final = np.zeros(1, np.int64)
@@ -134,8 +135,8 @@ def _region(boards: BitBoards) -> int:
 
 def _instructions(forest: Forest, starts: BitBoards, row: int) -> NDArray[np.int64]:
     """Return the instructions of the solution that was found in a level, [T] or none."""
-    pushes = forest.solution(row)
-    moves = np.zeros(forest.limit + 1, np.int64)
     start = (starts.box[row], int(starts.agent[row]))
+    pushes = shorten(starts.wall[row], *start, forest.solution(row))
+    moves = np.zeros(forest.limit + 1, np.int64)
     moves_of(~starts.wall[row], *start, pushes, np.random.default_rng(0), moves)
     return moves[: np.count_nonzero(moves)]

@@ -31,13 +31,14 @@ from mujoban_sokoban.solver_search import SOLVED, Workspace, search
 
 ABSENT: Final = 255
 """Cell of a box that a level lacks."""
-_UNREACHED = 127
+UNREACHED: Final = 127
+"""Distance of a square that cannot be walked to."""
 
 
 @njit(cache=True, nogil=True)
 def walk_distances(goal: Int, free: Bits, distance: NDArray[np.int8]) -> None:
-    """Write the walking distance of every square of `free` to a goal square, [SQUARES]; `_UNREACHED` elsewhere."""
-    distance[:] = _UNREACHED
+    """Write the walking distance of every square of `free` to a goal square, [SQUARES]; `UNREACHED` elsewhere."""
+    distance[:] = UNREACHED
     frontier = bit(goal)
     reached = frontier
     steps = 0
