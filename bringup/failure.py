@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bringup.results import EpisodeResult, Failure
-from mujoban_core.grid import AGENT, BOX, OFFSETS_RC, TARGET, WALL
+from mujoban_core.grid import AGENT, BOX, OFFSETS_RC, TARGET, WALL, Instruction
 from mujoban_sokoban.levels import walls_around
 from mujoban_sokoban.rules import abstract_successor
 from mujoban_sokoban.solver import Status, solve
@@ -133,6 +134,10 @@ def explain(decisions: list[DecisionRecord], last: NDArray[np.bool_]) -> Failure
     if is_unsolvable(decisions[-1].truth) and not is_unsolvable(decisions[0].truth):
         return _explain_loss(decisions)
     tail = decisions[-TAIL:]
+    # What was possible and not carried out, nobody's estimate is to blame for.
+    vain = (after.timed_out and _is_possible(before) for before, after in pairwise(tail))
+    if 3 * sum(vain) >= len(tail):
+        return Failure.CONTROLLER_TIME_OUT
     if 2 * sum(not d.estimate_right for d in tail) >= len(tail):
         return Failure.WRONG_ESTIMATE
     if 3 * sum(d.timed_out for d in tail) >= len(tail):
@@ -141,6 +146,14 @@ def explain(decisions: list[DecisionRecord], last: NDArray[np.bool_]) -> Failure
     if max(map(visits.count, visits)) >= LOOP_VISITS:
         return Failure.PLANNER_DEAD_END
     return Failure.TIME_LIMIT
+
+
+def _is_possible(decision: DecisionRecord) -> bool:
+    """Tell whether the robot can do what it was told to: stay, or go where neither wall nor box is in the way."""
+    if decision.instruction == Instruction.STAY:
+        return True
+    agent = decision.truth[..., AGENT]
+    return bool((abstract_successor(decision.truth, decision.instruction)[..., AGENT] != agent).any())
 
 
 def _explain_loss(decisions: list[DecisionRecord]) -> Failure:

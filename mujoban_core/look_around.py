@@ -2,8 +2,9 @@
 
 Irreversible pushes into the unknown are the first cause of failure under partial observation (paper, section 4). Two
 wrappers make any planner and any controller look around: the planner tells the robot to stay where it wants a look, or
-to walk to such a place, and the controller turns on the spot when it is told to stay. Neither pushes a box for it. A
-body that no single action turns has a controller that has learned to turn when it is told to stay, and needs the first
+to walk to such a place, and the controller turns on the spot when it is told to stay again after it has stayed: first
+the robot comes to rest in the middle of its cell, which after a push it is not in. Neither pushes a box for it. A body
+that no single action turns has a controller that has learned to turn when it is told to stay, and needs the first
 alone.
 
 Shapes: B robots, M of them with a decision to take, V viewpoints, N = `grid.GRID_SIZE`, U actuators.
@@ -49,6 +50,10 @@ _WALK_COST: Final = 0.5
 """Cells of gain that one step of the way is worth."""
 TURN_HEADINGS: Final = 0.4 * math.pi * np.arange(5)
 """Views that together make a turn, given the camera's 80 degrees."""
+_COMING_TO_REST: Final = -1
+"""In the place of the tick at which a look ends: it begins when the robot has stayed."""
+_AT_REST: Final = 10
+"""Ticks for which a robot turns after it was told that it has stayed; then it may have left the middle of its cell."""
 _CELLS: Final = GRID_SIZE * GRID_SIZE
 
 AnyModule = TypeVar("AnyModule", bound=Module)
@@ -82,8 +87,9 @@ class ScriptedScout(Scout):
 class LookAroundPlanner(Planner):
     """Looks around first, and wherever there is something to be seen; else says what another planner says.
 
-    Memory: that of the other planner; the tick of the episode and that at which the present look ends (0: none), int64
-    [B]; the instructions left for looking, int64 [B]; the cells that looks have shown, bool [B, N, N].
+    Memory: that of the other planner; the tick of the episode and that at which the present look ends (0: none, -1: it
+    begins when the robot has come to rest), int64 [B]; the instructions left for looking, int64 [B]; the cells that
+    looks have shown, bool [B, N, N].
     """
 
     def __init__(
@@ -122,6 +128,9 @@ class LookAroundPlanner(Planner):
         decision = np.full(len(tick), int(Instruction.STAY), np.int64)
         ready = np.zeros(len(tick), np.bool_)
         for i in np.flatnonzero(tick >= until):
+            if until[i] == _COMING_TO_REST:
+                until[i] = tick[i] + self.ticks
+                continue
             if until[i] > 0:  # A look has just ended: what it did not make certain will not become so from here
                 seen[i] |= turn_view(abstract_state[i], self.body)
                 until[i] = 0
@@ -132,7 +141,7 @@ class LookAroundPlanner(Planner):
             walks[i] -= 1
             decision[i] = step
             if step == Instruction.STAY:
-                until[i] = tick[i] + self.ticks
+                until[i] = _COMING_TO_REST
         rows = np.flatnonzero(ready)
         if rows.size:
             decision[rows], after = self.inner.decide(abstract_state[rows], take_rows(inner, rows))
@@ -153,7 +162,11 @@ class LookAroundPlanner(Planner):
 
 
 class LookAroundController(Controller):
-    """Turns on the spot where the robot is to STAY; else does what another controller does, whose memory it keeps."""
+    """Turns on the spot where the robot is to STAY and has just stayed; else does what another controller does.
+
+    Memory: that of the other controller; whether the robot was told to STAY, bool [B]; ticks for which it turns, this
+    one included, unless it is told that it has stayed again, int64 [B].
+    """
 
     def __init__(self, inner: Controller, turn: Sequence[float]) -> None:
         """Wrap `inner`; `turn` is the action, U values, that turns the robot on the spot."""
@@ -162,13 +175,16 @@ class LookAroundController(Controller):
         self._turn = np.array(turn, np.float32)
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return the other controller's memory at the start of `batch` episodes."""
-        return self.inner.initial_memory(batch)
+        """Return the memory at the start of `batch` episodes."""
+        return (*self.inner.initial_memory(batch), np.zeros(batch, np.bool_), np.zeros(batch, np.int64))
 
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques, [B, U], and the next memory; the other controller sees every tick."""
-        torque, memory = self.inner.step(inputs, state)
-        return np.where((inputs.instruction == int(Instruction.STAY))[:, None], self._turn, torque), memory
+        inner, (stayed, turns) = tuple(state[:-2]), state[-2:]
+        torque, memory = self.inner.step(inputs, inner)
+        stays = inputs.instruction == int(Instruction.STAY)
+        turns = np.where(stayed & inputs.terminated, _AT_REST, np.maximum(turns - 1, 0)) * stays
+        return np.where(turns[:, None] > 0, self._turn, torque), (*memory, stays, turns)
 
 
 def look_around(

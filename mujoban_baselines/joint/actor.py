@@ -20,7 +20,7 @@ from mujoban_baselines.joint.stack import DrawingController, DrawingPlanner
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_controller.controller import MEMORY_FIELDS, VisuomotorController
 from mujoban_controller.goal_features import privileged_features, side_ahead
-from mujoban_core.grid import CHANNELS, GRID_SIZE, INSTRUCTION_LIMIT, Instruction
+from mujoban_core.grid import CHANNELS, GRID_SIZE, INSTRUCTION_LIMIT
 from mujoban_core.interfaces import Observation, renew_rows
 from mujoban_core.look_around import look_around
 from mujoban_core.sense_plan_act import Decision, PolicyState, SensePlanAct
@@ -130,7 +130,8 @@ class JointActor(Actor):
         step = task.step(said.torque)
         self._log.rewarded(step.reward)
         self._log.ended(step.terminated, step.truncated)
-        kept = self._read(seen, said) | {name: m.numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
+        read = zip(MEMORY_FIELDS, memory[: len(MEMORY_FIELDS)], strict=True)
+        kept = self._read(seen, said, state) | {name: m.numpy() for name, m in read}
         kept |= {
             "features": features, "first": first, "reward": step.reward, "truncated": step.truncated,
             "discount": (~step.terminated).astype(np.float32),
@@ -145,12 +146,12 @@ class JointActor(Actor):
             self._state = renew_rows(self._state, self._fresh(), step.over)
         return kept
 
-    def _read(self, seen: Observation, said: Decision) -> dict[str, NDArray[Any]]:
-        """Return what the controller read and did."""
-        stays = said.instruction == int(Instruction.STAY)
+    def _read(self, seen: Observation, said: Decision, state: PolicyState) -> dict[str, NDArray[Any]]:
+        """Return what the controller read and did, and whether it was itself that drove."""
+        turned = state.controller[-1] > 0 if self._turns else np.zeros(self._task.batch, np.bool_)
         return {
             "frame": seen.frame, "proprio": seen.proprio, "instruction": said.instruction,
-            "terminated": said.termination.terminated, "action": said.torque, "driven": ~(self._turns & stays),
+            "terminated": said.termination.terminated, "action": said.torque, "driven": ~turned,
         }  # fmt: skip
 
     def _features(self, state: PolicyState) -> NDArray[np.float32]:

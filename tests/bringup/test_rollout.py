@@ -109,6 +109,18 @@ def test_a_controller_that_does_nothing_times_out(policy, corner):
     assert result.failure == Failure.CONTROLLER_TIME_OUT and result.time_outs >= 3
 
 
+@pytest.mark.parametrize(
+    ("move", "why"),
+    [(Instruction.EAST, (Failure.CONTROLLER_TIME_OUT, 4)), (Instruction.WEST, (Failure.WRONG_ESTIMATE, 0))],
+    ids=["possible", "blocked"],
+)
+def test_only_what_was_not_possible_is_put_down_to_a_wrong_estimate(policy, tmp_path, move, why):
+    write_levels(tmp_path / "blocked.txt", [Level.from_text(CORNER.replace("# $@ #\n#  . #", "#$@  #\n#.   #"))])
+    stuck = replace(policy, estimator=Blind(), planner=Scripted((move,) * 9), controller=Idle())
+    (result,) = evaluate(stuck, Episodes(1, 0, level_file=tmp_path / "blocked.txt"), time_limit=600)
+    assert (result.failure, result.time_outs) == why
+
+
 def test_an_episode_that_is_merely_too_short_ran_into_the_time_limit(policy):
     (result,) = evaluate(policy, Episodes(1, 0, difficulty=5), time_limit=60)
     assert result.failure == Failure.TIME_LIMIT and result.steps == 60

@@ -5,7 +5,8 @@ from bringup.command import Choice, Stack
 from bringup.rollout import ticks
 from mujoban_core.bodies import ANT, BALL, BODIES
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
-from mujoban_core.look_around import LookAroundPlanner, look_around, step_to_view
+from mujoban_core.interfaces import ControllerInput, Planner
+from mujoban_core.look_around import LookAroundPlanner, Scout, look_around, step_to_view
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.world import World
@@ -71,6 +72,54 @@ def test_no_walk_where_all_is_known_was_looked_at_or_lies_behind_a_box():
     closed = (*ROOM[:3], "##$#####", *ROOM[4:])
     step = step_to_view(estimate(*closed), NOTHING_SEEN)
     assert step is None or step == Instruction.STAY  # boxes hide nothing, but are in the way
+
+
+def test_a_robot_comes_to_rest_before_it_turns_and_turns_on_only_while_it_stays_there():
+    controller = look_around(OracleController(), 40)
+    state, driven = controller.initial_memory(1), []
+    #             a push, told to stay, has stayed, ...      drifts off, is said to have stayed,  goes on, stays
+    said = [(2, 0), (0, 1), (0, 0), (0, 0), (0, 1), (0, 1), *[(0, 0)] * 12, (0, 1), (2, 1), (0, 1), (0, 0), (0, 1)]
+    truth = World(1).truth()
+    for instruction, terminated in said:
+        observation = ControllerInput(
+            np.array([instruction]), np.zeros((1, 64, 64, 3), np.uint8), np.zeros((1, 17), np.float32),
+            np.array([terminated == 1]), truth,
+        )  # fmt: skip
+        torque, state = controller.step(observation, state)
+        driven.append(bool((torque[0] == np.float32([0.0, 0.7])).all()))
+    turns = [False] * 4 + [True] * 2 + [True] * 9 + [False] * 3 + [True] + [False] * 3 + [True]
+    assert driven == turns
+
+
+class Northward(Planner):
+    """Goes north."""
+
+    def initial_memory(self, batch):
+        return ()
+
+    def decide(self, abstract_state, memory):
+        return np.full(len(abstract_state), int(Instruction.NORTH)), memory
+
+
+class OnceMore(Scout):
+    """Wants a second look."""
+
+    wanted = True
+
+    def step(self, abstract_state, shown):
+        wanted, self.wanted = self.wanted, False
+        return Instruction.STAY if wanted else None
+
+
+def test_a_look_after_a_walk_begins_when_the_robot_has_come_to_rest():
+    planner = LookAroundPlanner(Northward(), 5, scout=OnceMore())
+    now, instructions = planner.initial_state(np.zeros(1, np.int64)), []
+    for tick in range(15):
+        # The first look ends with tick 5, in which the robot is told to stay for another; it rests from tick 9 on.
+        terminated = np.array([tick < 6 or tick > 8])
+        instruction, now = planner.step(estimate(*ROOM)[None], terminated, now)
+        instructions.append(int(instruction[0]))
+    assert instructions == [Instruction.STAY] * 14 + [Instruction.NORTH]
 
 
 def test_looks_come_to_an_end():
