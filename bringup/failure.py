@@ -149,10 +149,15 @@ def explain(decisions: list[DecisionRecord], last: NDArray[np.bool_]) -> Failure
 
 
 def _is_possible(decision: DecisionRecord) -> bool:
-    """Tell whether the robot can do what it was told to: stay, or go where neither wall nor box is in the way."""
+    """Tell whether the robot can do what it was told to: stay, or go where neither wall nor box is in the way.
+
+    A state that the rules do not know, without a robot or with two, says nothing.
+    """
     if decision.instruction == Instruction.STAY:
         return True
     agent = decision.truth[..., AGENT]
+    if agent.sum() != 1:
+        return False
     return bool((abstract_successor(decision.truth, decision.instruction)[..., AGENT] != agent).any())
 
 
