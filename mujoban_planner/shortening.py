@@ -5,7 +5,7 @@ they are not in each other's way, and a search that was led to its pushes one by
 order of the fewest moves is found exactly, by Dijkstra's algorithm over how far each box has come: (n_1 + 1) * ... *
 (n_K + 1) states for K boxes of n_k pushes, some hundreds, a tenth of a millisecond. The boxes' paths stay as they are.
 
-Boards are those of `mujoban_sokoban.bitboard`. Shapes: T pushes, K boxes, L squares of the longest path.
+Boards are those of `mujoban_sokoban.bitboard`. Shapes: T pushes, K boxes.
 """
 
 from __future__ import annotations
