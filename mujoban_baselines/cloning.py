@@ -19,6 +19,7 @@ from torch.nn import functional
 
 from mujoban_baselines.agents import MonolithicAgent
 from mujoban_baselines.networks import Recurrent
+from mujoban_core.ranges import check_counts
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
 from mujoban_msgs_py.bags.training import episodes, find_bags, open_training_bag
@@ -52,8 +53,7 @@ class CloningConfig:
 
     def __post_init__(self) -> None:
         """Reject batches without a tick."""
-        if self.rows < 1 or self.window < 1:
-            raise ValueError(f"rows {self.rows}, window {self.window}: expected at least 1 of each")
+        check_counts(self, "rows", "window")
 
 
 class BagSource(Source[Batch]):

@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from mujoban_baselines.actor import memory_of
 from mujoban_baselines.networks import RecurrentAgent
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_rl.actors import Arrays
 from mujoban_rl.engine import Learner, Scalars
 from mujoban_rl.limits import NaNGuard
@@ -46,10 +47,10 @@ class VTraceTrainingConfig:
 
     def __post_init__(self) -> None:
         """Reject unrolls without a step, and numbers out of their range."""
-        if self.unroll < 1:
-            raise ValueError(f"unroll {self.unroll}: expected at least 1 step")
-        if not 0.0 < self.gamma <= 1.0 or not self.rate > 0.0:
-            raise ValueError(f"gamma {self.gamma}, rate {self.rate}: expected more than 0, gamma at most 1")
+        check_counts(self, "unroll")
+        check_shares(self, "gamma")
+        check_positive(self, "gamma", "rate", "clip")
+        check_not_negative(self, "auxiliary", "beyond")
 
     @property
     def length(self) -> int:

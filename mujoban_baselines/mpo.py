@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from mujoban_baselines.actor import memory_of
 from mujoban_baselines.critics import Critic
 from mujoban_baselines.networks import AgentOutput, RecurrentAgent
+from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_rl.actors import ReplayStore
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.limits import NaNGuard
@@ -71,20 +72,13 @@ class MPOTrainingConfig:
     def __post_init__(self) -> None:
         """Reject windows in which nothing is learned, an odd number of samples, and numbers out of their range."""
         check_samples(self.samples)
-        for name in ("windows", "n_step", "target_period"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} {getattr(self, name)}: expected at least 1")
-        for name in ("reuse", "rate"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} {getattr(self, name)}: expected more than 0")
-        if not 0.0 < self.gamma <= 1.0 or self.warm_up < 0 or self.first < 0:
-            raise ValueError(
-                f"gamma {self.gamma}, warm_up {self.warm_up}, first {self.first}: expected more than 0 and at most 1, "
-                "and at least 0 of the others"
-            )
+        check_counts(self, "windows", "n_step", "target_period")
+        check_counts(self, "warm_up", "first", "critic_first", "normalised", least=0)
+        check_shares(self, "gamma")
+        check_positive(self, "gamma", "reuse", "rate", "clip")
         if self.window <= self.overlap:
             raise ValueError(
-                f"window {self.window}: expected more ticks than warm_up {self.warm_up} and n_step {self.n_step} have"
+                f"window is {self.window}: expected more than warm_up {self.warm_up} and n_step {self.n_step}"
             )
 
     @property

@@ -26,6 +26,7 @@ from mujoban_controller.play import Batch, CameraPlayer, Fields
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_rl.engine import Scalars, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
@@ -79,6 +80,17 @@ class DistilConfig:
 
     skipped = 0
     """Ticks of a window in which nothing is learned."""
+
+    def __post_init__(self) -> None:
+        """Reject numbers with which nothing is learned, and windows that no sequence holds."""
+        check_counts(self, "window", "windows", "replay")
+        check_counts(self, "first", "warm_up", least=0)
+        check_shares(self, "guided", "warm_up_share", "jitter", "average")
+        check_positive(self, "reuse", "learning_rate", "clip")
+        weights = ("goal_weight", "kind_weight", "heading_weight", "infeasible_weight")
+        check_not_negative(self, "wander", "noise", *weights)
+        if self.sequence < self.window:
+            raise ValueError(f"sequence is {self.sequence}: expected at least the ticks of a window, {self.window}")
 
 
 class GoalHead(nn.Module):

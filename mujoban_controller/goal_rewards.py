@@ -11,6 +11,7 @@ Shapes: B robots, U actuators.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,12 @@ class RewardConfig:
     """Radians per second beyond which turning faster earns no more."""
     backwards: float = 0.0
     """Cost of a tick in which the robot moves backwards."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no number."""
+        for name, value in vars(self).items():
+            if not math.isfinite(value):
+                raise ValueError(f"{name} is {value}: expected a finite number")
 
 
 def potential(world: GoalView, config: RewardConfig) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from mujoban_controller.goal_rewards import RewardConfig
 from mujoban_controller.instructions import EXACT, InstructionConfig, TerminationConfig
 from mujoban_core.grid import COMPLETION_TOLERANCE, DIFFICULTIES
+from mujoban_core.ranges import check_counts, check_shares
 from mujoban_sim.presets import DEFAULT_WORLD, get_world
 
 
@@ -52,14 +53,15 @@ class GoalTaskConfig:
     def __post_init__(self) -> None:
         """Reject settings that contradict each other."""
         get_world(self.world)
-        if not self.horizon > 0:
-            raise ValueError(f"horizon {self.horizon}: expected a positive number of steps")
-        if not 0.0 <= self.retry <= 1.0:
-            raise ValueError(f"retry {self.retry}: expected a share between 0 and 1")
+        check_counts(self, "batch", "patience")
+        check_shares(self, "planned", "astray", "retry", "misaligned", "robot_offset", "box_offset")
+        for name in ("horizon", "overshoot"):  # `inf` is never
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: expected a number above 0")
         if self.difficulty not in DIFFICULTIES:
-            raise ValueError(f"difficulty {self.difficulty}: expected one of {sorted(DIFFICULTIES)}")
+            raise ValueError(f"difficulty is {self.difficulty}: expected one of {sorted(DIFFICULTIES)}")
         if not 0.0 < self.tolerance <= COMPLETION_TOLERANCE:
-            raise ValueError(f"tolerance {self.tolerance}: expected at most the evaluation's {COMPLETION_TOLERANCE}")
+            raise ValueError(f"tolerance is {self.tolerance}: expected at most the evaluation's {COMPLETION_TOLERANCE}")
 
 
 def judging_config(

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.grid import INSTRUCTION_LIMIT, Instruction
+from mujoban_core.ranges import check_counts, check_not_negative, check_shares
 from mujoban_sim.goals import GoalKind, GoalTracker
 from mujoban_sim.world import World
 
@@ -35,6 +36,10 @@ class InstructionConfig:
     """Share of pushes among the others, where there are any."""
     repeat: float = 0.4
     """Chance that a push goes on in the same direction, where it can."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no share."""
+        check_shares(self, "stay", "stays_on", "infeasible", "push", "repeat")
 
 
 def feasible_kinds(world: World) -> NDArray[np.int64]:
@@ -89,6 +94,12 @@ class TerminationConfig:
     """An early signal comes within up to this distance, in cells, beyond the tolerance."""
     limit: int = INSTRUCTION_LIMIT
     """Ticks after which a signal is forced."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no share or no time."""
+        check_shares(self, "late", "early")
+        check_not_negative(self, "delay", "reach")
+        check_counts(self, "limit")
 
 
 EXACT = TerminationConfig(late=0.0, early=0.0)

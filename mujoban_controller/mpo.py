@@ -23,6 +23,7 @@ from mujoban_controller.policy import GoalPolicy
 from mujoban_controller.privileged import Critic
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.bodies import get_body
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_rl.engine import Scalars, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
@@ -77,12 +78,17 @@ class MPOTrainingConfig:
         return self.n_step
 
     def __post_init__(self) -> None:
-        """Reject windows that hold no n-step return, or that no sequence holds."""
+        """Reject numbers with which nothing is learned, and windows that hold no n-step return or no sequence holds."""
+        check_counts(self, "windows", "replay", "n_step", "target_period")
+        check_counts(self, "first", "critic_first", "normalised", least=0)
+        check_shares(self, "gamma", "average")
+        check_positive(self, "gamma", "reuse", "policy_rate", "critic_rate", "clip")
+        check_not_negative(self, "explore")
         if self.sequence < self.window:
-            raise ValueError(f"sequence {self.sequence}: expected at least the ticks of a window, {self.window}")
+            raise ValueError(f"sequence is {self.sequence}: expected at least the ticks of a window, {self.window}")
         check_samples(self.samples)
         if self.window <= self.n_step:
-            raise ValueError(f"window {self.window}: expected more ticks than n_step {self.n_step}")
+            raise ValueError(f"window is {self.window}: expected more ticks than n_step {self.n_step}")
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,13 @@ class AsymmetricConfig(MPOTrainingConfig):
     initial_scale: float = 0.0
     """Standard deviation of the torques at the start; 0: the policy's own. That of a distilled one is a tenth: within
     it values hardly differ, and the critic's errors do."""
+
+    def __post_init__(self) -> None:
+        """Reject numbers with which the critic learns nothing as well."""
+        super().__post_init__()
+        check_counts(self, "critic_updates", least=0)
+        check_counts(self, "critic_windows", "critic_replay")
+        check_not_negative(self, "initial_scale")
 
     @property
     def critic_draw(self) -> CriticDraw | None:

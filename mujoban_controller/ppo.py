@@ -23,6 +23,7 @@ from mujoban_controller.judge import OutcomeSummary
 from mujoban_controller.privileged import PrivilegedPolicy, Value
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.bodies import get_body
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_rl.engine import Scalars, Source, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.ppo import PPOConfig, generalised_advantages, ppo_loss
@@ -56,6 +57,16 @@ class PPOTrainingConfig:
     normalised: int = 300
     """Updates after which the normalisation of features stays as it is."""
     loss: PPOConfig = field(default_factory=PPOConfig)
+
+    def __post_init__(self) -> None:
+        """Reject numbers with which nothing is learned."""
+        check_counts(self, "length", "epochs", "minibatch")
+        check_counts(self, "normalised", least=0)
+        check_shares(self, "gamma", "decay")
+        check_positive(self, "rate", "least_rate", "largest_rate", "target_kl", "clip")
+        check_not_negative(self, "bound_weight", "mirror_weight")
+        if self.least_rate > self.largest_rate:
+            raise ValueError(f"least_rate is {self.least_rate}: expected at most largest_rate, {self.largest_rate}")
 
 
 class Rollout(NamedTuple):

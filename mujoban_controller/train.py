@@ -40,6 +40,7 @@ from mujoban_controller.ppo import PPOLearner, PPOTrainingConfig, RolloutSource
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
 from mujoban_controller.product import Validation
 from mujoban_core.program import read_options, run_command
+from mujoban_core.ranges import check_counts, check_positive
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
@@ -97,6 +98,8 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Reject settings that contradict each other."""
+        check_counts(self, "steps")
+        check_positive(self, "cpu_seconds")
         if self.teacher is not None and self.stage != "distil":
             raise ValueError(f"--teacher {self.teacher}: only the stage distil has a teacher, not {self.stage}")
         if self.teacher is None and self.stage == "distil":

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from mujoban_core.bodies import get_body
 from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
 from mujoban_core.interfaces import Estimator, EstimatorInput, Memory
+from mujoban_core.ranges import check_counts
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.geometry import ANCHORS, CELLS, FEATURES, cell_geometry
 
@@ -43,9 +44,7 @@ class EstimatorConfig:
 
     def __post_init__(self) -> None:
         """Reject sizes that are not positive."""
-        for name in ("stem", "channels", "blocks", "embedding", "belief", "update_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: expected at least 1")
+        check_counts(self, "stem", "channels", "blocks", "embedding", "belief", "update_every")
 
 
 class Belief(NamedTuple):

@@ -5,7 +5,6 @@ Shapes: S streams, T ticks of a stretch, K = T / `update_every` frames that the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 
 from mujoban_core.grid import OFFSETS_XY
 from mujoban_core.interfaces import renew_rows
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_estimator.data import Batch, Windows, choose_windows
 from mujoban_estimator.estimator import Belief, EstimatorConfig, StateEstimator
 from mujoban_estimator.evaluate import evaluate
@@ -62,14 +62,9 @@ class LearnerConfig:
         differing = [n for n in shared if getattr(self.estimator, n) != getattr(self.termination, n)]
         if differing:
             raise ValueError(f"estimator and termination differ in {', '.join(differing)}: expected one shared ResNet")
-        for name in ("window_frames", "window_length"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: expected at least 1")
-        for name in ("unseen", "frame", "place", "cells", "slip"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}: expected a finite number from 0 on")
-        if not 0.0 <= self.lost <= 1.0:
-            raise ValueError(f"lost is {self.lost}: expected a share from 0 to 1")
+        check_counts(self, "window_frames", "window_length")
+        check_not_negative(self, "unseen", "frame", "place", "cells", "slip")
+        check_shares(self, "lost")
 
 
 @dataclass(frozen=True)
@@ -101,13 +96,11 @@ class TrainConfig:
         every = self.learner.estimator.update_every
         if self.length < 1 or self.length % every:
             raise ValueError(f"length is {self.length}: expected a multiple of update_every, {every}")
-        if self.streams < 1 or self.steps < 1:
-            raise ValueError(f"{self.streams} streams, {self.steps} steps: expected at least 1")
+        check_counts(self, "streams", "steps")
+        check_positive(self, "cpu_seconds", "learning_rate", "clip")
         if not 1 <= self.shards <= self.streams:
             raise ValueError(f"{self.shards} shards of {self.streams} streams: expected 1 to {self.streams}")
-        for name in ("warm_up", "final_rate"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} is {getattr(self, name)}: expected a share from 0 to 1")
+        check_shares(self, "warm_up", "final_rate")
 
 
 def _learned_for(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:

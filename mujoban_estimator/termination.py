@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from mujoban_core.bodies import get_body
 from mujoban_core.grid import INSTRUCTION_LIMIT
 from mujoban_core.interfaces import Memory, Termination, TerminationInput
+from mujoban_core.ranges import check_counts
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.odometry import FEATURES, Odometry, Track, turn
 
@@ -44,9 +45,7 @@ class TerminationConfig:
 
     def __post_init__(self) -> None:
         """Reject what is out of range."""
-        for name in ("stem", "channels", "blocks", "camera", "hidden", "limit"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: expected at least 1")
+        check_counts(self, "stem", "channels", "blocks", "camera", "hidden", "limit")
         if not 0.0 < self.threshold < 1.0:
             raise ValueError(f"threshold is {self.threshold}: expected a number between 0 and 1")
 

@@ -18,6 +18,7 @@ import numpy as np
 from mujoban_core.files import check_file, digest
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.program import read_options, run_command
+from mujoban_core.ranges import check_counts
 from mujoban_core.reports import give_report
 from mujoban_core.stats import wilson_interval
 from mujoban_core.threads import set_threads
@@ -25,7 +26,6 @@ from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import take_levels
 from mujoban_planner.lookahead import LookAheadPlanner
-from mujoban_planner.option_checks import check_counts
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
 from mujoban_rl.sealed_levels import noted_use

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.imitation import ImitationLearner, LearnerConfig
-from mujoban_planner.option_checks import check_counts, check_positive, check_shares
 from mujoban_planner.samples import Batch
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
 from mujoban_rl.actors import ActorOptions, ActorSource

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.ranges import check_counts, check_positive
 from mujoban_planner.boards import BitBoards
-from mujoban_planner.option_checks import check_counts, check_positive
 from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.push_policy import PushPolicy
 from mujoban_planner.training_levels import Ticket, TrainingLevels, stream_number

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards, signed
-from mujoban_planner.option_checks import check_counts, check_positive, check_shares
 from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
 from mujoban_planner.push_policy import PushPolicy, images
 from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical
 
+from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards
-from mujoban_planner.option_checks import check_counts, check_positive, check_shares
 from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
 from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
 from mujoban_planner.validation import success_rates

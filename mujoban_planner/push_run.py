@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
+from mujoban_core.ranges import check_counts
 from mujoban_planner.growth import start_from
-from mujoban_planner.option_checks import check_counts
 from mujoban_planner.push_policy import PushPolicy
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Budget

@@ -22,11 +22,11 @@ import torch
 from torch import Tensor
 
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.ranges import check_counts, check_shares
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import BitBoards, level_batch
 from mujoban_planner.forest import Forest, Verdicts
 from mujoban_planner.lessons import errs
-from mujoban_planner.option_checks import check_counts, check_shares
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch, unlabelled
 from mujoban_planner.search import grow
 from mujoban_planner.symmetry import SYMMETRIES

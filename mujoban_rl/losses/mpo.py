@@ -7,9 +7,8 @@ Shape legend: B states, D dimensions of the action.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -113,10 +112,3 @@ def scalars(statistics: Mapping[str, Tensor], prefix: str = "mpo") -> dict[str, 
 def _inverse_softplus(value: Tensor) -> Tensor:
     exact = value.to(torch.float64)
     return (exact + torch.log(-torch.expm1(-exact))).float()
-
-
-def check_positive(config: Any, *, may_be_zero: tuple[str, ...] = ()) -> None:
-    """Raise a `ValueError` that names the first field of a configuration that is not above 0."""
-    for name, value in vars(config).items():
-        if not (value > 0 or (name in may_be_zero and value == 0)) or not math.isfinite(value):
-            raise ValueError(f"{name} is {value}: expected a number above 0")

@@ -17,7 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
-from mujoban_rl.losses.mpo import Duals, Improvement, check_positive, improve, trust_region
+from mujoban_core.ranges import check_not_negative, check_positive
+from mujoban_rl.losses.mpo import Duals, Improvement, improve, trust_region
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class MPOConfig:
 
     def __post_init__(self) -> None:
         """Reject constraints that cannot hold."""
-        check_positive(self, may_be_zero=("epsilon_penalty",))
+        check_not_negative(self, "epsilon_penalty")
+        check_positive(self, *(name for name in vars(self) if name != "epsilon_penalty"))
 
 
 class MPOStats(NamedTuple):
@@ -68,7 +70,7 @@ def check_samples(samples: int) -> None:
         ValueError: If it is odd.
     """
     if samples < 2 or samples % 2:
-        raise ValueError(f"samples {samples}: expected an even number from 2 on")
+        raise ValueError(f"samples is {samples}: expected an even number from 2 on")
 
 
 def paired_noise(samples: int, like: Tensor, generator: torch.Generator) -> Tensor:

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, kl_divergence
 from torch.nn import functional
 
-from mujoban_rl.losses.mpo import Duals, check_positive, improve, trust_region
+from mujoban_core.ranges import check_positive
+from mujoban_rl.losses.mpo import Duals, improve, trust_region
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class DiscreteMPOConfig:
 
     def __post_init__(self) -> None:
         """Reject constraints that cannot hold."""
-        check_positive(self)
+        check_positive(self, *vars(self))
 
 
 class DiscreteMPOStats(NamedTuple):

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mujoban_core.ranges import check_not_negative
+
 
 @dataclass(frozen=True)
 class PPOConfig:
@@ -21,8 +23,9 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         """Reject bounds that bound nothing."""
+        check_not_negative(self, "value_weight")
         if not 0.0 < self.clip < 1.0:
-            raise ValueError(f"clip {self.clip}: expected a number between 0 and 1")
+            raise ValueError(f"clip is {self.clip}: expected a number between 0 and 1")
 
 
 def generalised_advantages(

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from mujoban_core.ranges import check_not_negative, check_positive
+
 
 @dataclass(frozen=True)
 class VTraceConfig:
@@ -26,9 +28,8 @@ class VTraceConfig:
 
     def __post_init__(self) -> None:
         """Reject bounds with which nothing is learned."""
-        for name in ("clip_rho", "clip_c"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}: expected a positive number")
+        check_positive(self, "clip_rho", "clip_c")
+        check_not_negative(self, "value_weight", "entropy_weight")
         if self.clip_c > self.clip_rho:
             raise ValueError(f"clip_c {self.clip_c} above clip_rho {self.clip_rho}: expected at most that")
 

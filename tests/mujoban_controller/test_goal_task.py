@@ -187,11 +187,11 @@ def test_what_failed_is_tried_again_from_where_it_began():
 
 
 def test_settings_that_contradict_the_evaluation_are_refused():
-    with pytest.raises(ValueError, match=r"tolerance 0\.2"):
+    with pytest.raises(ValueError, match=r"tolerance is 0\.2"):
         GoalTaskConfig(tolerance=0.2)
-    with pytest.raises(ValueError, match="retry 2"):
+    with pytest.raises(ValueError, match=r"retry is 2\.0: expected a share"):
         GoalTaskConfig(retry=2.0)
-    with pytest.raises(ValueError, match="difficulty 9"):
+    with pytest.raises(ValueError, match="difficulty is 9"):
         judging_config(4, difficulty=9)
 
 

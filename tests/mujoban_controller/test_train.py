@@ -15,7 +15,9 @@ import torch
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
 from mujoban_controller.episodes import TrainingEpisodes
+from mujoban_controller.goal_rewards import RewardConfig
 from mujoban_controller.goal_settings import GoalTaskConfig
+from mujoban_controller.instructions import InstructionConfig, TerminationConfig
 from mujoban_controller.mpo import AsymmetricConfig, MPOTrainingConfig
 from mujoban_controller.ppo import PPOTrainingConfig
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
@@ -43,6 +45,27 @@ STAGES = {
     ),
     "distil": TrainConfig(stage="distil", teacher=Path("teacher"), task=TASK, network=NETWORK, distil=DISTIL),
 }
+
+
+@pytest.mark.parametrize(
+    ("settings", "name", "value", "expected"),
+    [
+        (DistilConfig, "windows", 0, "at least 1"),
+        (DistilConfig, "sequence", 4, "at least the ticks of a window, 8"),
+        (PPOTrainingConfig, "gamma", 1.5, "a share"),
+        (PPOTrainingConfig, "least_rate", 0.1, "at most largest_rate"),
+        (MPOTrainingConfig, "policy_rate", 0.0, "a number above 0"),
+        (AsymmetricConfig, "critic_windows", 0, "at least 1"),
+        (GoalTaskConfig, "astray", math.nan, "a share"),
+        (InstructionConfig, "push", -0.1, "a share"),
+        (TerminationConfig, "delay", math.inf, "a finite number"),
+        (RewardConfig, "time", math.nan, "a finite number"),
+        (TrainConfig, "steps", 0, "at least 1"),
+    ],
+)
+def test_a_setting_out_of_its_range_is_named(settings, name, value, expected):
+    with pytest.raises(ValueError, match=f"{name} is {value}: expected {expected}"):
+        settings(**{name: value})
 
 
 @pytest.fixture(scope="module")

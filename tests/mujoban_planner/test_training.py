@@ -252,7 +252,8 @@ def test_an_option_out_of_its_range_is_named_before_anything_begins(tmp_path, ca
     arguments = [method, "--run", str(tmp_path / "run"), option, value]
     assert exit_status("train", partial(train.main, arguments)) == 2
     error = capsys.readouterr().err.strip()
-    assert option in error and "expected" in error and len(error.splitlines()) == 1
+    name = option[2:].replace("-", "_")
+    assert f"{name} is {value}" in error and "expected" in error and len(error.splitlines()) == 1
     assert not (tmp_path / "run").exists()
 
 

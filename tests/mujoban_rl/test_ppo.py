@@ -67,5 +67,5 @@ def test_a_bandit_is_learned():
 
 
 def test_a_clip_that_bounds_nothing_is_refused():
-    with pytest.raises(ValueError, match=r"clip 1\.5: expected a number between 0 and 1"):
+    with pytest.raises(ValueError, match=r"clip is 1\.5: expected a number between 0 and 1"):
         PPOConfig(clip=1.5)
