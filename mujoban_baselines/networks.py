@@ -63,7 +63,8 @@ class _Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [M, C, H, W] to the same."""
-        return x + self.second(functional.relu(self.first(functional.relu(x))))
+        y = self.second(functional.relu(self.first(functional.relu(x)), inplace=True))
+        return y.add_(x)
 
 
 def view_encoder(features: int, channels: Sequence[int] = (16, 32, 32), blocks: int = 2) -> nn.Sequential:
@@ -74,7 +75,7 @@ def view_encoder(features: int, channels: Sequence[int] = (16, 32, 32), blocks: 
         layers += [nn.Conv2d(width, outputs, 3, padding=1), nn.MaxPool2d(3, 2, 1)]
         layers += [_Residual(outputs) for _ in range(blocks)]
         width, edge = outputs, edge // 2
-    layers += [nn.ReLU(), nn.Flatten(), nn.Linear(width * edge * edge, features), nn.ReLU()]
+    layers += [nn.ReLU(inplace=True), nn.Flatten(), nn.Linear(width * edge * edge, features), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
 
 

@@ -27,7 +27,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return features of the same shape, [N, C, H, W]."""
-        return x + self.second(torch.relu(self.first(torch.relu(x))))
+        y = self.second(self.first(torch.relu(x)).relu_())
+        return y.add_(x)  # in place, as no gradient needs what was there before
 
 
 class FrameEncoder(nn.Module):
@@ -40,10 +41,10 @@ class FrameEncoder(nn.Module):
         self.layers = nn.Sequential(
             nn.Conv2d(3, stem, 4, stride=2, padding=1),
             ResidualBlock(stem),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(stem, channels, 4, stride=2, padding=1),
             *(ResidualBlock(channels) for _ in range(blocks)),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
         ).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def forward(self, frames: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ from mujoban_core.program import say
 from mujoban_core.signals import StopSignal
 from mujoban_core.text import readable
 from mujoban_rl.limits import NaNGuard, TimeLimit
+from mujoban_rl.memory import keep_freed_memory
 from mujoban_rl.progress import Budget, Clock, Meter, Progress
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.training_log import TrainingLog
@@ -224,6 +225,7 @@ class Trainer(Generic[BatchT]):
             Interrupted: If a signal came; the run is saved then.
         """
         children.end_with_parent()
+        keep_freed_memory()
         samples = min(self.budget.samples, limit_samples)
         total = None if math.isinf(samples) else int(samples)
         limits = _Limits(TimeLimit(limit_seconds), limit_samples, limit_updates)

@@ -136,7 +136,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [B, C, H, W] to [B, C', H / stride, W / stride]."""
-        return functional.relu(self.shortcut(x) + self.second(functional.relu(self.first(x))))
+        y = self.second(functional.relu(self.first(x), inplace=True))
+        return functional.relu(y.add_(self.shortcut(x)), inplace=True)
 
 
 def frame_encoder(channels: Sequence[int], features: int, rows: int) -> nn.Sequential:
@@ -152,14 +153,14 @@ def frame_encoder(channels: Sequence[int], features: int, rows: int) -> nn.Seque
             f"each at least {_NARROWEST}"
         )
     stem, *widths = channels
-    layers: list[nn.Module] = [nn.Conv2d(3, stem, 4, 2, 1), nn.ReLU()]
+    layers: list[nn.Module] = [nn.Conv2d(3, stem, 4, 2, 1), nn.ReLU(inplace=True)]
     shrink, width = 2, stem
     for i, outputs in enumerate(widths):
         stride = 1 if i == len(widths) - 1 else 2
         layers.append(ResidualBlock(width, outputs, stride))
         shrink, width = shrink * stride, outputs
     flat = width * (rows // shrink) * (FRAME_SIZE // shrink)
-    layers += [nn.Flatten(), nn.Linear(flat, features), nn.LayerNorm(features), nn.ReLU()]
+    layers += [nn.Flatten(), nn.Linear(flat, features), nn.LayerNorm(features), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
 
 

@@ -16,6 +16,7 @@ import torch
 
 from mujoban_rl.actors.actor import ActorError, ActorFactory, Arrays, Experience, Order, Seat
 from mujoban_rl.actors.pool import ActorDied, ActorPool, Schedule
+from mujoban_rl.memory import keep_freed_memory
 
 _ANSWER_SECONDS: Final = 5.0
 """Time that a cluster has to answer; Ray itself asks on for minutes."""
@@ -192,6 +193,7 @@ class _RemoteSeat:
     """A seat in a process of Ray's."""
 
     def __init__(self, stream: int, threads: int) -> None:
+        keep_freed_memory()
         torch.set_num_threads(threads)
         self._stream = stream
         self._seat: Seat | None = None

@@ -16,6 +16,7 @@ import torch
 from mujoban_core import children
 from mujoban_rl.actors.actor import ActorError, ActorFactory, Experience, Order, Seat
 from mujoban_rl.actors.pool import ActorDied, ActorPool, Schedule
+from mujoban_rl.memory import keep_freed_memory
 
 _CONTEXT: Final = multiprocessing.get_context("spawn")
 _GRACE: Final = 1.0
@@ -132,6 +133,7 @@ class ProcessPool(ActorPool):
 def _serve(pipe: Connection, factory: ActorFactory, stream: int, threads: int) -> None:
     """Carry out orders until the pipe is closed."""
     children.end_with_parent()
+    keep_freed_memory()
     torch.set_num_threads(threads)
     try:
         seat = Seat(factory(stream))
