@@ -10,6 +10,7 @@ U actuators.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
@@ -39,11 +40,11 @@ Batch = dict[str, Tensor]
 class MPOTrainingConfig:
     """Settings of MPO; where not said otherwise those of Acme."""
 
-    window: int = 24
+    window: int = 40
     """W."""
     warm_up: int = 4
     """b."""
-    windows: int = 16
+    windows: int = 10
     """M."""
     replay: int = 32_000
     """Environment steps in the replay; each is a frame, and checkpoints carry them."""
@@ -124,9 +125,11 @@ class MPOLearner(Learner[Batch]):
         agent.mixed_precision = True
         self.loss = MPOLoss(agent.action_size, config.loss)
         self.target_agent, self.target_critic = deepcopy(agent), deepcopy(critic)
-        self._adam = torch.optim.Adam([*agent.parameters(), *critic.parameters()], config.rate)
+        self._adam = torch.optim.Adam([*agent.parameters(), *critic.parameters()], config.rate, fused=True)
         self._dual_adam = self.loss.duals.adam(config.loss.dual_learning_rate)
         self._updates = 0
+        # Targets are computed beside what the online agent says, on what the actors leave of the cores.
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="target")
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -161,13 +164,9 @@ class MPOLearner(Learner[Batch]):
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one step of agent, critic and dual variables."""
         config, warm = self.config, self.config.warm_up
-        with torch.no_grad():
-            target = self._over(self.target_agent, batch, 0)
-            noise = paired_noise(config.samples, target.action.mean, self._generator)
-            # Shapes [N, M, W, U] and [N, M, W].
-            action = target.action.mean + target.action.scale * noise
-            q = self.target_critic(self.target_critic.state(batch, target.features), action)
+        weighed = self._beside.submit(self._weigh, batch)
         online = self._over(self.agent, batch, warm)
+        target, action, q = weighed.result()
         critic_loss = self._critic_loss(batch, online, q.mean(0))
         policy = online.action
         if self.critic.teaches_torso:
@@ -189,6 +188,14 @@ class MPOLearner(Learner[Batch]):
             self.target_agent.load_state_dict(self.agent.state_dict())
             self.target_critic.load_state_dict(self.critic.state_dict())
         return {"loss/critic": float(critic_loss.detach()), **scalars(stats._asdict()), "gradient_norm": float(norm)}
+
+    @torch.no_grad()
+    def _weigh(self, batch: Batch) -> tuple[AgentOutput, Tensor, Tensor]:
+        """Return what the target agent says, actions drawn from it, [N, M, W, U], and their values, [N, M, W]."""
+        target = self._over(self.target_agent, batch, 0)
+        noise = paired_noise(self.config.samples, target.action.mean, self._generator)
+        action = target.action.mean + target.action.scale * noise
+        return target, action, self.target_critic(self.target_critic.state(batch, target.features), action)
 
     def _over(self, agent: RecurrentAgent, batch: Batch, skipped: int) -> AgentOutput:
         """Return an agent's output in the ticks of windows from number `skipped` on, [M, W - skipped, ...]."""

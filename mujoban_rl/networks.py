@@ -59,7 +59,7 @@ def encode_frames(encoder: nn.Module, frame: Tensor, dtype: torch.dtype, *, mixe
         mixed_precision: Whether the ResNet computes in bfloat16, where that pays.
     """
     # A permuted NHWC tensor is channels_last already.
-    x = frame.permute(0, 3, 1, 2).to(dtype) / 255.0 - 0.5
+    x = (frame.permute(0, 3, 1, 2).to(dtype) / 255.0).sub_(0.5)
     with autocast(frame.device, enabled=mixed_precision):
         return encoder(x).to(dtype)
 
