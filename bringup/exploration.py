@@ -35,7 +35,7 @@ _FOREVER: Final = 1 << 30
 _WALK: Final = 25
 """Random instructions in place of a planner that does not know what to do."""
 _WITS_END: Final = 4
-"""Instructions to stay in a row that show it: a planner that wants another look says so once or twice."""
+"""Instructions to stay in a row that show it: a planner that looks around says so once or twice."""
 _PERSISTENCE: Final = 0.8
 """Correlation of the torques' noise from one tick to the next."""
 

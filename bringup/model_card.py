@@ -75,8 +75,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "Solves most levels, not all: what it loses ends nearly always in a state that only search proves dead. Boards "
         "of 8 x 8 inner cells; more than four boxes were not trained on.",
         "what was tried loses attraction; verdicts on pushes are weighed by a constant, and before a push called "
-        "deadly it stays and looks again; a fixed recursion by the rules of Sokoban tells what can be reached and the "
-        "way to a push; a rule says where to look before each decision, for up to 30 instructions",
+        "deadly it looks at the board from every side; a fixed recursion by the rules of Sokoban tells what can be "
+        "reached and the way to a push; a rule says where to look before each decision, for up to 30 instructions",
         {
             "imitation": "supervised, by an optimal solver, also on its own play",
             "expert-iteration": "by its own play and search, without a solver",

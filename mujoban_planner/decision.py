@@ -129,38 +129,28 @@ def running_mean(views: int, seen: Tensor, before: Tensor, now: Tensor) -> Tenso
     return before + share[:, None, None, None] * (now - before)
 
 
-def abstain(
-    abstract_state: NDArray[np.float32],
-    decision: NDArray[np.int64],
-    means: PushMeans,
-    counts: VisitCounts,
-    *,
-    doubt: float,
-    perspectives: int,
-) -> NDArray[np.int64]:
-    """Return the decisions, [M], with STAY in place of pushes that may be deadly and deserve another look.
+def doubtful(
+    abstract_state: NDArray[np.float32], decision: NDArray[np.int64], means: PushMeans, doubt: float
+) -> NDArray[np.bool_]:
+    """Return which decisions, [M], are pushes that may be deadly and deserve more thought.
 
-    A push cannot be taken back, and standing still costs little. Recurrent planners learn to pace before hard pushes
-    for the same reason: it gives them time to think (Taufeeque et al. 2024).
+    A push cannot be taken back. Recurrent planners learn to pace before hard pushes for the same reason: it gives them
+    time to think (Taufeeque et al. 2024).
 
     Args:
         abstract_state: [M, N, N, 4].
         decision: The decisions so far, [M].
         means: Of the pushes, these decisions included.
-        counts: What was tried before. Where estimates flicker, means end with the boxes that they were about, so
-            that the decisions to stay in a cell are bounded as well.
-        doubt: Probability that a push is deadly from which on another look is worth its time.
-        perspectives: Views after which there is nothing new to see.
+        doubt: Probability that a push is deadly from which on it deserves it.
     """
-    again = (means.views < perspectives) & (counts.since_arrival[:, _STAY] < perspectives)
-    rows = np.flatnonzero(again & (decision != _STAY))
+    rows = np.flatnonzero(decision != _STAY)
     direction, states = decision[rows] - 1, abstract_state[rows]
     ahead = (likeliest_cells(states) + _STEPS[direction]) % _CELLS
     p_alive = np.exp(means.push_alive.reshape(-1, len(_STEPS), INTERIOR**2)[rows, direction, _INTERIOR_CELL[ahead]])
     pushes = states.reshape(-1, _CELLS, len(CHANNELS))[np.arange(len(rows)), ahead, BOX] > 0.5
-    decision = decision.copy()
-    decision[rows[pushes & (p_alive < 1.0 - doubt)]] = _STAY
-    return decision
+    deadly = np.zeros(len(decision), np.bool_)
+    deadly[rows] = pushes & (p_alive < 1.0 - doubt)
+    return deadly
 
 
 def state_keys(abstract_state: NDArray[np.float32]) -> NDArray[np.int64]:

@@ -18,14 +18,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_core.grid import CHANNELS, GRID_SIZE
-from mujoban_core.interfaces import Memory, Planner
+from mujoban_core.interfaces import Memory, Planner, put_rows, take_rows
 from mujoban_planner.compiled import CompiledDecision
 from mujoban_planner.decision import (
     PushMeans,
     VisitCounts,
     VisitMemory,
-    abstain,
     count_visits,
+    doubtful,
     initial_means,
     initial_visits,
     push_penalty,
@@ -40,7 +40,7 @@ from mujoban_planner.propagation import PLANES, propagate
 CAUTION = 4.0
 """Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/research)."""
 DOUBT = 0.02
-"""Probability that a push is deadly from which on the planner looks again before it, by default (docs/research)."""
+"""Probability that a push is deadly from which on a planner looks from every side before it, by default."""
 
 
 class LearnedPlanner(nn.Module, Planner):
@@ -48,9 +48,9 @@ class LearnedPlanner(nn.Module, Planner):
 
     The decision is greedy over log pi(A | s) + caution * log(1 - p(dead | s, A)), one forward pass, less a penalty for
     what was already tried (`decision.visit_penalty`, `decision.push_penalty`), so that it neither repeats for ever a
-    move that does nothing nor runs in circles. What it says of the pushes is averaged over the decisions in which
-    the boxes stand as they do (`decision.PushMeans`), and before a push that may be deadly it stands still until it
-    has looked from every side (`decision.abstain`). The rule is deterministic; what it remembers is its explicit
+    move that does nothing nor runs in circles. What it says of the pushes is averaged over the views of the board that
+    it took since the boxes stand as they do (`decision.PushMeans`): another side in each decision, and before a push
+    that may be deadly (`decision.doubtful`) every side. The rule is deterministic; what it remembers is its explicit
     memory.
     """
 
@@ -72,7 +72,7 @@ class LearnedPlanner(nn.Module, Planner):
         self.caution = CAUTION
         """Weight of the verdicts on pushes and instructions in a decision; 1 is as trained."""
         self.doubt = DOUBT
-        """Probability that a push is deadly from which on the planner looks again before it; 1 is never."""
+        """Probability that a push is deadly from which on the planner looks from every side before it; 1 is never."""
         self.compiled: CompiledDecision | None = None
         """`weigh` for a single robot as an exported graph, of the weights that were loaded."""
 
@@ -150,12 +150,20 @@ class LearnedPlanner(nn.Module, Planner):
     def choose(
         self, abstract_state: NDArray[np.float32], counts: VisitCounts, means: PushMeans
     ) -> tuple[NDArray[np.int64], PushMeans]:
-        """Return the instruction of the highest score, or STAY to look again first, [M], and means; see `scores`."""
+        """Return the instruction of the highest score, [M], and means; see `scores`.
+
+        While that is a push that may be deadly, the board is looked at from another side, until all were seen.
+        """
         scores, means = self.scores(abstract_state, counts, means)
-        best = np.argmax(scores, axis=1)
-        decision = abstain(
-            abstract_state, best, means, counts, doubt=self.doubt, perspectives=self.perspectives
-        )
+        decision = np.argmax(scores, axis=1)
+        for _ in range(self.perspectives - 1):
+            again = means.views < self.perspectives
+            rows = np.flatnonzero(again & doubtful(abstract_state, decision, means, self.doubt))
+            if not rows.size:
+                break
+            part = VisitCounts(*take_rows(counts, rows)), PushMeans(*take_rows(means, rows))
+            scores, seen = self.scores(abstract_state[rows], *part)
+            decision[rows], means = np.argmax(scores, axis=1), PushMeans(*put_rows(means, rows, seen))
         return decision, means
 
     @torch.inference_mode()

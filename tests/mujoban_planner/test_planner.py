@@ -9,7 +9,7 @@ from mujoban_planner.boards import abstract_states
 from mujoban_planner.decision import HISTORY, count_visits, initial_means, initial_visits, recall, remember
 from mujoban_planner.heads import Advice, PlannerHeads
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
-from mujoban_planner.planner import LearnedPlanner, input_planes
+from mujoban_planner.planner import LearnedPlanner, input_planes, split_memory
 from mujoban_planner.play import play
 from mujoban_planner.propagation import legal_pushes
 from mujoban_planner.symmetry import (
@@ -288,54 +288,60 @@ def test_decisions_look_at_the_boxes_from_another_side_each_time():
 
 
 class Doubtful(Stubborn):
-    """Wants to go north and takes every push for deadly with some probability."""
+    """Wants to go north, takes every push for deadly with some probability, and counts how often it looks."""
 
     perspectives = SYMMETRIES
 
     def __init__(self, p_dead):
         super().__init__()
         self.p_dead = p_dead
+        self.looks: list[list[int]] = []
 
     def advise(self, states, seen):
+        self.looks.append(seen.tolist())
         advice = super().advise(states, seen)
         return advice._replace(push_alive=torch.full((len(states), 4, 8, 8), 1.0 - self.p_dead).log())
 
 
-@pytest.mark.parametrize(
-    ("p_dead", "ahead", "looks"),
-    [(0.1, "#  $     #", SYMMETRIES - 1), (0.001, "#  $     #", 0), (0.1, "#     $  #", 0)],
-)
-def test_planner_looks_from_every_side_before_a_push_that_may_be_deadly(p_dead, ahead, looks):
+def _before_a_push(ahead):
     rock = "#" * GRID_SIZE + "\n"
-    state = abstract_states(stack_levels([Level.from_text(
+    return abstract_states(stack_levels([Level.from_text(
         rock + "#.   .  .#\n" + "#   $    #\n" + f"{ahead}\n" + "#  @   $ #\n" + 4 * "#        #\n" + rock
     )]))
-    planner = Doubtful(p_dead).eval()
+
+
+@pytest.mark.parametrize(
+    ("p_dead", "ahead", "looks"),
+    [(0.1, "#  $     #", SYMMETRIES), (0.001, "#  $     #", 1), (0.1, "#     $  #", 1)],
+)
+def test_planner_looks_from_every_side_before_a_push_that_may_be_deadly(p_dead, ahead, looks):
+    planner, state = Doubtful(p_dead).eval(), _before_a_push(ahead)
     memory = planner.initial_state(np.zeros(1, np.int64)).memory
-    decisions = []
-    for _ in range(SYMMETRIES):
-        decision, memory = planner.decide(state, memory)
-        decisions.append(Instruction(decision[0]))
-    assert decisions[:looks] == [Instruction.STAY] * looks and decisions[looks] == Instruction.NORTH
-    planner.doubt = 1.0
-    assert planner.decide(state, planner.initial_state(np.zeros(1, np.int64)).memory)[0][0] == Instruction.NORTH
+    decision, memory = planner.decide(state, memory)
+    assert Instruction(decision[0]) == Instruction.NORTH
+    assert planner.looks == [[side] for side in range(looks)], "one side after another"
+    if looks == SYMMETRIES:
+        planner.decide(state, memory)
+        assert len(planner.looks) == SYMMETRIES + 1, "with the boxes where they are no side tells anything new"
 
 
-def test_planner_does_not_hesitate_for_ever_where_estimates_flicker():
-    rock = "#" * GRID_SIZE + "\n"
-    states = [
-        abstract_states(stack_levels([Level.from_text(
-            rock + "#.   .  .#\n" + f"#  {far}#\n" + "#  $     #\n" + "#  @   $ #\n" + 4 * "#        #\n" + rock
-        )]))
-        for far in ("$     ", " $    ")
-    ]
+def test_planner_that_doubts_nothing_looks_once():
     planner = Doubtful(0.1).eval()
-    memory = planner.initial_state(np.zeros(1, np.int64)).memory
-    decisions = []
-    for k in range(12):
-        decision, memory = planner.decide(states[k % 2], memory)
-        decisions.append(Instruction(decision[0]))
-    assert decisions == [Instruction.STAY] * SYMMETRIES + [Instruction.NORTH] * 4
+    planner.doubt = 1.0
+    planner.decide(_before_a_push("#  $     #"), planner.initial_state(np.zeros(1, np.int64)).memory)
+    assert planner.looks == [[0]]
+
+
+def test_only_robots_in_doubt_look_again():
+    planner = Doubtful(0.1).eval()
+    states = np.concatenate([_before_a_push("#     $  #"), _before_a_push("#  $     #")])
+    decision, memory = planner.decide(states, planner.initial_state(np.zeros(2, np.int64)).memory)
+    assert decision.tolist() == [Instruction.NORTH] * 2
+    assert planner.looks == [[0, 0], *([side] for side in range(1, SYMMETRIES))]
+    _, means = split_memory(memory)
+    assert means.views.tolist() == [1, SYMMETRIES]
+    alone = planner.decide(states[1:], planner.initial_state(np.zeros(1, np.int64)).memory)[1]
+    assert all(np.array_equal(a[1:], b) for a, b in zip(memory, alone, strict=True)), "each as if it were alone"
 
 
 def test_means_end_where_the_boxes_move():
