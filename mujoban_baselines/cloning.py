@@ -112,7 +112,7 @@ class CloningLearner(Learner[Batch]):
         """Train `agent` in place; its scale stays what it is, for MPO to explore with."""
         self.agent, self.config = agent, config
         agent.mixed_precision = True
-        self._adam = torch.optim.Adam(agent.parameters(), config.rate)
+        self._adam = torch.optim.Adam(agent.parameters(), config.rate, fused=True)
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(0.02))
         self._memory = Recurrent(*agent.initial_memory(config.rows))
 

@@ -67,7 +67,7 @@ class VTraceLearner(Learner[Arrays]):
         agent.mixed_precision = True
         self.value, self.pseudo_value = (nn.Linear(agent.width, 1) for _ in range(2))
         parameters = [p for module in self.modules.values() for p in module.parameters()]
-        self._adam = torch.optim.Adam(parameters, config.rate)
+        self._adam = torch.optim.Adam(parameters, config.rate, fused=True)
         self._schedule = ProgressSchedule(self._adam, lambda progress: 1.0 - progress)
 
     @property

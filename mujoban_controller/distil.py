@@ -207,7 +207,7 @@ class DistilLearner(ProductLearner[Batch]):
         self.head = GoalHead(student.hidden + student.config["features"])
         self._average = moving_average(student, config.average, warm_up=True)
         parameters = [*student.parameters(), *self.head.parameters()]
-        self._adam = torch.optim.Adam(parameters, config.learning_rate, foreach=True)
+        self._adam = torch.optim.Adam(parameters, config.learning_rate, fused=True)
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up_share))
 
     @property

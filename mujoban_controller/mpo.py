@@ -171,8 +171,8 @@ class MPOLearner(ProductLearner[Batch]):
         self.target_policy, self.target_critic = deepcopy(policy), deepcopy(self.critic)
         self._average = moving_average(policy, config.average) if config.average else None
         self._actuators = torch.from_numpy(feature_layout(get_body(body)).actuators)
-        self._policy_adam = torch.optim.Adam(policy.parameters(), config.policy_rate)
-        self._critic_adam = torch.optim.Adam(self.critic.parameters(), config.critic_rate)
+        self._policy_adam = torch.optim.Adam(policy.parameters(), config.policy_rate, fused=True)
+        self._critic_adam = torch.optim.Adam(self.critic.parameters(), config.critic_rate, fused=True)
         self._dual_adam = self.loss.duals.adam(config.loss.dual_learning_rate)
         self._updates = self._critic_updates = 0
 

@@ -160,7 +160,8 @@ class PPOLearner(ProductLearner[Rollout]):
         layout = feature_layout(get_body(body))
         self._mirror, self._mirror_action = layout.mirror, layout.mirror_action
         self._turning = layout.holds if get_body(body).turn is None else None
-        self._adam = torch.optim.Adam([*policy.parameters(), *self.value.parameters()], config.rate, eps=1e-5)
+        parameters = [*policy.parameters(), *self.value.parameters()]
+        self._adam = torch.optim.Adam(parameters, config.rate, eps=1e-5, fused=True)
         self._generator = generator
         self._rounds = 0
 

@@ -149,7 +149,7 @@ class EstimatorLearner(Learner[Batch]):
         self.termination = ControlTermination(self.estimator.encoder, **vars(self.config.termination)).to(self.device)
         both = {id(p): p for module in self.modules.values() for p in module.parameters()}
         self._parameters = list(both.values())
-        self.optimiser = torch.optim.Adam(self._parameters, config.learning_rate)
+        self.optimiser = torch.optim.Adam(self._parameters, config.learning_rate, fused=True)
         self._schedule = ProgressSchedule(self.optimiser, warm_up_linear(config.warm_up, config.final_rate))
         self._threads = ThreadPoolExecutor(
             config.shards, "shard", torch.set_num_threads, (torch.get_num_threads(),)

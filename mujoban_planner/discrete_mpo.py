@@ -132,7 +132,7 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
         self.network = network.to(self.device).train()
         self.target = copy.deepcopy(self.network).eval()
         self.mpo = DiscreteMPO(config.mpo).to(self.device)
-        self._adam = torch.optim.Adam(self.network.parameters(), config.learning_rate)
+        self._adam = torch.optim.Adam(self.network.parameters(), config.learning_rate, fused=True)
         self._dual_adam = self.mpo.duals.adam(config.dual_learning_rate)
         self._updates = 0
 

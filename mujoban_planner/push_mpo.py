@@ -88,7 +88,7 @@ class PushMPOLearner(Learner[Window]):
         self.policy = starting_policy(config)
         self._average = moving_average(self.policy, config.average, warm_up=True)
         self.mpo = DiscreteMPO(config.mpo)
-        self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5)
+        self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5, fused=True)
         self._dual_adam = self.mpo.duals.adam(config.dual_learning_rate)
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up))
         self._rng = np.random.default_rng([config.seed, 8])

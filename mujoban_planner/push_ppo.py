@@ -66,7 +66,7 @@ class PushPPOLearner(Learner[Arrays]):
         """Build a policy, or start from a planner's weights."""
         self.config = config
         self.policy = starting_policy(config)
-        self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5)
+        self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5, fused=True)
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up))
         self._rng = np.random.default_rng([config.seed, 7])
 
