@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import BALL, Body
-from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, OFFSETS_XY, WALL, Instruction
 from mujoban_core.interfaces import (
     Controller,
     ControllerInput,
@@ -41,7 +41,7 @@ WALKS: Final = 30
 MIN_GAIN: Final = 3
 """Cells that a viewpoint must promise to be worth a walk."""
 _UNCERTAIN: Final = (0.05, 0.95)
-"""A cell is unknown where the probability of a wall lies between these and no look has shown it."""
+"""A cell is unknown where the probability of a wall lies between these and it has not been in view."""
 _OPAQUE: Final = 0.9
 """Probability of a wall from which on it hides what lies behind; guesses about unseen cells stay below."""
 FREE: Final = 0.3
@@ -55,6 +55,8 @@ _COMING_TO_REST: Final = -1
 _AT_REST: Final = 10
 """Ticks for which a robot turns after it was told that it has stayed; then it may have left the middle of its cell."""
 _CELLS: Final = GRID_SIZE * GRID_SIZE
+_OWN: Final = 5
+"""Parts of the memory that are the wrapper's own."""
 
 AnyModule = TypeVar("AnyModule", bound=Module)
 
@@ -68,7 +70,7 @@ class Scout(ABC):
 
         Args:
             abstract_state: Estimate, [N, N, 4].
-            shown: Cells that turns have shown, [N, N]: what they have not made certain will not become so by looking.
+            shown: Cells that have been in view, [N, N]: what that has not made certain will not become so by looking.
         """
 
 
@@ -89,7 +91,7 @@ class LookAroundPlanner(Planner):
 
     Memory: that of the other planner; the tick of the episode and that at which the present look ends (0: none, -1: it
     begins when the robot has come to rest), int64 [B]; the instructions left for looking, int64 [B]; the cells that
-    looks have shown, bool [B, N, N].
+    have been in view, by where the robot was and which way it walked, bool [B, N, N]; what it was told last, int64 [B].
     """
 
     def __init__(
@@ -117,13 +119,14 @@ class LookAroundPlanner(Planner):
         """Return the memory at the start of `batch` episodes, each of which begins with a look."""
         tick, until = np.zeros(batch, np.int64), np.full(batch, self.ticks)
         seen = np.zeros((batch, GRID_SIZE, GRID_SIZE), np.bool_)
-        return (*self.inner.initial_memory(batch), tick, until, np.full(batch, self.walks), seen)
+        told = np.full(batch, int(Instruction.STAY))
+        return (*self.inner.initial_memory(batch), tick, until, np.full(batch, self.walks), seen, told)
 
     def decide(
         self, abstract_state: NDArray[np.float32], memory: Memory
     ) -> tuple[NDArray[np.int64], Memory]:
         """Return STAY for a look, a step towards one, or the other planner's instruction, [M], and the memory."""
-        inner, (tick, until, walks, seen) = tuple(memory[:-4]), memory[-4:]
+        inner, (tick, until, walks, seen, told) = tuple(memory[:-_OWN]), memory[-_OWN:]
         until, walks, seen = until.copy(), walks.copy(), seen.copy()
         decision = np.full(len(tick), int(Instruction.STAY), np.int64)
         ready = np.zeros(len(tick), np.bool_)
@@ -131,9 +134,12 @@ class LookAroundPlanner(Planner):
             if until[i] == _COMING_TO_REST:
                 until[i] = tick[i] + self.ticks
                 continue
-            if until[i] > 0:  # A look has just ended: what it did not make certain will not become so from here
+            # What was in view and is not certain will not become so from here.
+            if until[i] > 0:  # A look has just ended
                 seen[i] |= turn_view(abstract_state[i], self.body)
                 until[i] = 0
+            elif told[i] != Instruction.STAY:
+                seen[i] |= walk_view(abstract_state[i], Instruction(told[i]), self.body)
             step = None if walks[i] == 0 else self.scout.step(abstract_state[i], seen[i])
             if step is None:
                 ready[i] = True
@@ -146,19 +152,19 @@ class LookAroundPlanner(Planner):
         if rows.size:
             decision[rows], after = self.inner.decide(abstract_state[rows], take_rows(inner, rows))
             inner = put_rows(inner, rows, after)
-        return decision, (*inner, tick, until, walks, seen)
+        return decision, (*inner, tick, until, walks, seen, decision.copy())
 
     def think(self, abstract_state: NDArray[np.float32], memory: Memory) -> Memory:
         """Let the other planner think."""
-        return (*self.inner.think(abstract_state, tuple(memory[:-4])), *memory[-4:])
+        return (*self.inner.think(abstract_state, tuple(memory[:-_OWN])), *memory[-_OWN:])
 
     def step(
         self, abstract_state: NDArray[np.float32], terminated: NDArray[np.bool_], state: PlannerState
     ) -> tuple[NDArray[np.int64], PlannerState]:
         """Return A_t, [B], and count the tick."""
         instruction, state = super().step(abstract_state, terminated, state)
-        *others, tick, until, walks, seen = state.memory
-        return instruction, state._replace(memory=(*others, tick + 1, until, walks, seen))
+        *others, tick, until, walks, seen, told = state.memory
+        return instruction, state._replace(memory=(*others, tick + 1, until, walks, seen, told))
 
 
 class LookAroundController(Controller):
@@ -216,7 +222,7 @@ def step_to_view(
 
     Args:
         abstract_state: Estimate, [N, N, 4].
-        seen: Cells that looks have shown, [N, N].
+        seen: Cells that have been in view, [N, N].
         body: Carries the camera.
     """
     wall = abstract_state[..., WALL]
@@ -238,12 +244,31 @@ def turn_view(abstract_state: NDArray[np.float32], body: Body = BALL) -> NDArray
     return _views(abstract_state[..., WALL], np.array([here]), body).reshape(GRID_SIZE, GRID_SIZE)
 
 
-def _views(wall: NDArray[np.float32], cells: NDArray[np.int64], body: Body) -> NDArray[np.bool_]:
-    """Return which cells a turn in each of `cells`, [V], shows, [V, N * N]."""
+def walk_view(
+    abstract_state: NDArray[np.float32], direction: Instruction, body: Body = BALL
+) -> NDArray[np.bool_]:
+    """Return which cells a robot sees that has walked into its cell in a direction, by an estimate, [N, N].
+
+    A body that is alike from several sides may look another way: of what it sees nothing is known.
+    """
+    if body.symmetry.sides > 1:
+        return np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
+    here, ahead = np.argmax(abstract_state[..., AGENT]), OFFSETS_XY[direction]
+    heading = np.array([math.atan2(ahead[1], ahead[0])])
+    return _views(abstract_state[..., WALL], np.array([here]), body, heading).reshape(GRID_SIZE, GRID_SIZE)
+
+
+def _views(
+    wall: NDArray[np.float32],
+    cells: NDArray[np.int64],
+    body: Body,
+    headings: NDArray[np.floating] = TURN_HEADINGS,
+) -> NDArray[np.bool_]:
+    """Return which cells are seen from each of `cells`, [V], with any of some headings, [V, N * N]."""
     half = (GRID_SIZE - 1) / 2
     x, y = body.cell_size * (cells % GRID_SIZE - half), body.cell_size * (half - cells // GRID_SIZE)
-    turns = len(TURN_HEADINGS)
-    pose = np.stack([np.repeat(x, turns), np.repeat(y, turns), np.tile(TURN_HEADINGS, len(cells))], -1)
+    turns = len(headings)
+    pose = np.stack([np.repeat(x, turns), np.repeat(y, turns), np.tile(headings, len(cells))], -1)
     opaque = np.broadcast_to(wall > _OPAQUE, (len(pose), GRID_SIZE, GRID_SIZE))
     view = cells_in_view(opaque, pose, body.camera, body.cell_size)
     return np.any(view.reshape(len(cells), turns, _CELLS), axis=1)

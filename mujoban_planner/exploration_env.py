@@ -23,11 +23,11 @@ from mujoban_planner.uncertainty import BORDER, guesses, visible
 from mujoban_rl.engine import State
 
 SHOWN: Final = 4
-"""Channel of the cells that looks have shown, behind those of the abstract state."""
+"""Channel of the cells that have been in view, behind those of the abstract state."""
 CHANNELS: Final = SHOWN + 1
 _HEADINGS: Final = np.arctan2(-OFFSETS_RC[:, 0].astype(float), OFFSETS_RC[:, 1].astype(float))
 """Direction of travel of each instruction in radians; that of STAY is not used."""
-_CHANGING: Final = ("level", "agent", "seen", "shown", "guess", "steps")
+_CHANGING: Final = ("level", "agent", "seen", "guess", "steps")
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class ExplorationStep(NamedTuple):
 class ExplorationEnvironment:
     """E levels that are explored.
 
-    Observation: estimate and cells that looks have shown, float32 [E, N, N, 5]. Action: STAY (a turn on the spot), a
+    Observation: estimate and cells that have been in view, float32 [E, N, N, 5]. Action: STAY (a turn on the spot), a
     step north, east, south or west. Reward: see `ExplorationReward`. Every episode begins with a turn. To stop is worth
     nothing and needs no action: whoever expects less of every action stops.
     """
@@ -77,8 +77,7 @@ class ExplorationEnvironment:
         self.agent = np.zeros((batch, 2), np.int64)
         """(row, column)."""
         self.seen = np.zeros((batch, GRID_SIZE, GRID_SIZE), np.bool_)
-        self.shown = np.zeros_like(self.seen)
-        """Cells that turns on the spot have shown."""
+        """Cells that have been in view."""
         self.guess = np.zeros(self.level.shape, np.float32)
         self.steps = np.zeros(batch, np.int64)
         self.begin(np.arange(batch), levels)
@@ -88,15 +87,13 @@ class ExplorationEnvironment:
         self.level[rows] = levels > 0.5
         self.guess[rows] = guesses(self.level[rows], np.zeros(len(rows), np.bool_), self._rng)
         self.agent[rows] = np.argwhere(self.level[rows][..., AGENT])[:, 1:]
-        self.seen[rows], self.shown[rows], self.steps[rows] = BORDER, BORDER, 0
+        self.seen[rows], self.steps[rows] = BORDER, 0
         self._look(rows)
 
     def _look(self, rows: NDArray[np.int64]) -> None:
         turned = np.repeat(rows, len(TURN_HEADINGS))
         view = self._view(turned, np.tile(TURN_HEADINGS, len(rows)))
-        view = view.reshape(len(rows), len(TURN_HEADINGS), GRID_SIZE, GRID_SIZE).any(1)
-        self.seen[rows] |= view
-        self.shown[rows] |= view
+        self.seen[rows] |= view.reshape(len(rows), len(TURN_HEADINGS), GRID_SIZE, GRID_SIZE).any(1)
 
     def _view(self, rows: NDArray[np.int64], heading: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return which cells a robot sees in its cell with a heading, [M, N, N]."""
@@ -110,11 +107,11 @@ class ExplorationEnvironment:
         return (visible(self.level) & ~self.seen).sum((1, 2))
 
     def observe(self) -> NDArray[np.float32]:
-        """Return estimates with the cells that looks have shown, [E, N, N, 5]."""
+        """Return estimates with the cells that have been in view, [E, N, N, 5]."""
         state = np.where(self.seen[..., None], self.level, self.guess)
         state[..., AGENT] = 0.0
         state[np.arange(len(state)), self.agent[:, 0], self.agent[:, 1], AGENT] = 1.0
-        return np.concatenate([state, self.shown[..., None]], -1).astype(np.float32)
+        return np.concatenate([state, self.seen[..., None]], -1).astype(np.float32)
 
     def step(self, action: NDArray[np.int64]) -> ExplorationStep:
         """Execute an action in every level, [E]."""

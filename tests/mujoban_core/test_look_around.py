@@ -6,7 +6,7 @@ from bringup.rollout import ticks
 from mujoban_core.bodies import ANT, BALL, BODIES
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
 from mujoban_core.interfaces import ControllerInput, Planner
-from mujoban_core.look_around import LookAroundPlanner, Scout, look_around, step_to_view
+from mujoban_core.look_around import LookAroundPlanner, Scout, look_around, step_to_view, walk_view
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.world import World
@@ -122,6 +122,37 @@ def test_a_look_after_a_walk_begins_when_the_robot_has_come_to_rest():
     assert instructions == [Instruction.STAY] * 14 + [Instruction.NORTH]
 
 
+@pytest.mark.parametrize(("direction", "room", "behind"), [(3, True, False), (1, False, True)])
+def test_a_robot_has_seen_what_lies_ahead_of_where_it_walked(direction, room, behind):
+    state = estimate(*(row.replace("@", " ") for row in ROOM))
+    state[4, 3, AGENT] = 1.0
+    seen = walk_view(state, Instruction(direction))
+    assert seen[5:7, 3].all() == room and seen[1:4, 3].all() == behind
+
+
+def test_a_body_that_is_alike_from_all_sides_may_have_looked_another_way():
+    assert not walk_view(estimate(*ROOM), Instruction.EAST, ANT).any()
+
+
+def test_no_second_look_at_what_was_in_view_on_a_walk():
+    class Wanderer(Scout):
+        """Walks east once, and notes what it is told was in view."""
+
+        told: list = []  # noqa: RUF012
+
+        def step(self, abstract_state, shown):
+            self.told.append(shown.copy())
+            return Instruction.EAST if len(self.told) == 1 else None
+
+    scout, state = Wanderer(), estimate(*ROOM)
+    planner = LookAroundPlanner(Northward(), 1, scout=scout)
+    now = planner.initial_state(np.zeros(1, np.int64))
+    for _ in range(4):
+        _, now = planner.step(state[None], np.array([True]), now)
+    turned, walked = scout.told[:2]
+    assert (walked == turned | walk_view(state, Instruction.EAST)).all()
+
+
 def test_looks_come_to_an_end():
     planner = LookAroundPlanner(OraclePlanner(), 2, walks=5)
     state = estimate(*ROOM)[None]
@@ -132,7 +163,7 @@ def test_looks_come_to_an_end():
         instruction, now = planner.step(state, np.array([True]), now)
         instructions.append(int(instruction[0]))
     assert instructions[:2] == [0, 0]
-    assert now.memory[-2][0] == 0
+    assert now.memory[-3][0] == 0
 
 
 def test_a_body_that_no_single_action_turns_is_told_to_stay_and_its_controller_has_to_turn_it():

@@ -59,7 +59,7 @@ def test_cells_that_come_into_view_are_rewarded_once_and_steps_cost(environment)
     gained.append(float(environment.step(stay).reward[0]))
     assert gained[-1] == environment.seen.sum() - before - 0.5 > 0
     last = environment.step(stay)
-    assert environment.shown[0, 1, 5] and last.reward == -0.5
+    assert environment.seen[0, 1, 5] and last.reward == -0.5
     assert bool(last.complete[0]) == (environment.remaining[0] == 0)
 
 
