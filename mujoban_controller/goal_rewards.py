@@ -53,8 +53,9 @@ class RewardConfig:
     """Cost of a tick in which no side of the robot looks along the instruction."""
     tilt: float = 0.1
     """Cost of a tick in which the robot lies on its side."""
-    turn: float = 1.0
-    """Of each radian by which a robot turns to its left while it is to hold, where no single action turns it."""
+    turn: float = 5.0
+    """Of each radian by which a robot that is to hold turns to its left in its place, where no single action turns it:
+    a gait has to earn more than it costs in torques, also while it is still slow."""
     fastest_turn: float = 2.0
     """Radians per second beyond which turning faster earns no more."""
     backwards: float = 0.0
@@ -118,7 +119,8 @@ class GoalReward:
         reward = c.progress * (potential(world, c) - there)
         reward += c.completed * completed + c.failed * failed
         if body.turn is None:
-            reward += self._turning(world) - c.completed * (completed & (world.goals.direction == Instruction.STAY))
+            stayed = completed & (world.goals.direction == Instruction.STAY)
+            reward += self._turning(world) * completed - c.completed * stayed
         reward -= c.drift * (drift(world) - drifted)
         reward -= c.time + c.effort * np.square(change).sum(1) + c.tilt * (1.0 - upright(world))
         reward -= c.heading * self._off_course(world)

@@ -195,11 +195,11 @@ def test_settings_that_contradict_the_evaluation_are_refused():
         judging_config(4, difficulty=9)
 
 
-def turning_is_worth(body):
+def turning_is_worth(body, in_place=True):
     """Return what a tick in which the robot turns to its left at 1 rad/s is worth more than one at rest."""
     settings = InstructionConfig(stay=1.0)
     task = make(body=body, planned=0.0, misaligned=0.0, instructions=settings, terminations=EXACT)
-    world, ends, reward = task.world, np.zeros((2, 4), np.bool_), GoalReward(RewardConfig())
+    world, ends, reward = task.world, np.array([[in_place] * 4, [False] * 4]), GoalReward(RewardConfig())
     there, still = reward.before(world), np.zeros((4, world.body.action_size), np.float32)
     at = world.body.proprio
     world.proprio[:, at.up_axis] = 0.0, 0.0, 1.0
@@ -215,6 +215,7 @@ def turning_is_worth(body):
 def test_to_turn_is_rewarded_where_no_single_action_does_it():
     assert turning_is_worth("ball") == pytest.approx(np.zeros(4))
     assert turning_is_worth("ant") == pytest.approx(np.full(4, RewardConfig().turn * CONTROL_PERIOD), abs=1e-5)
+    assert turning_is_worth("ant", in_place=False) == pytest.approx(np.zeros(4)), "a look begins where a STAY has ended"
 
 
 @pytest.mark.parametrize(("stays_on", "least", "most"), [(1.0, 1.0, 1.0), (0.0, 0.0, 0.5)])
