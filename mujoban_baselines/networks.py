@@ -13,14 +13,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn import functional
 
 from mujoban_core.agent import Agent, AgentInput
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import GRID_SIZE
 from mujoban_core.interfaces import Memory
-from mujoban_rl.networks import Gaussian, Normaliser, encode_frames, gaussian, gaussian_layers
+from mujoban_rl.networks import Gaussian, Normaliser, PreActivatedBlock, encode_frames, gaussian, gaussian_layers
 
 Sights = Mapping[str, NDArray[Any]]
 """What an agent sees and its networks read, by name, [B, ...] each."""
@@ -51,29 +50,13 @@ class BodySense(nn.Module):
         return torch.cat(parts, -1)
 
 
-class _Residual(nn.Module):
-    """Two 3x3 convolutions, each after a ReLU, beside the identity (Espeholt et al. 2018)."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.first = nn.Conv2d(channels, channels, 3, padding=1)
-        self.second = nn.Conv2d(channels, channels, 3, padding=1)
-        with torch.no_grad():
-            self.second.weight.mul_(0.5)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map [M, C, H, W] to the same."""
-        y = self.second(functional.relu(self.first(functional.relu(x)), inplace=True))
-        return y.add_(x)
-
-
 def view_encoder(features: int, channels: Sequence[int] = (16, 32, 32), blocks: int = 2) -> nn.Sequential:
     """Return the ResNet of paper D.2 from views [M, 3, 64, 64] to features [M, F]: a stage halves the resolution."""
     layers: list[nn.Module] = []
     width, edge = 3, FRAME_SIZE
     for outputs in channels:
         layers += [nn.Conv2d(width, outputs, 3, padding=1), nn.MaxPool2d(3, 2, 1)]
-        layers += [_Residual(outputs) for _ in range(blocks)]
+        layers += [PreActivatedBlock(outputs, gain=0.5) for _ in range(blocks)]
         width, edge = outputs, edge // 2
     layers += [nn.ReLU(inplace=True), nn.Flatten(), nn.Linear(width * edge * edge, features), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)

@@ -50,6 +50,8 @@ _WALK_COST: Final = 0.5
 """Cells of gain that one step of the way is worth."""
 TURN_HEADINGS: Final = 0.4 * math.pi * np.arange(5)
 """Views that together make a turn, given the camera's 80 degrees."""
+WALK_HEADINGS: Final = np.arctan2(OFFSETS_XY[:, 1], OFFSETS_XY[:, 0])
+"""Direction of travel of each instruction in radians; that of STAY is not used."""
 _COMING_TO_REST: Final = -1
 """In the place of the tick at which a look ends: it begins when the robot has stayed."""
 _AT_REST: Final = 10
@@ -253,8 +255,7 @@ def walk_view(
     """
     if body.symmetry.sides > 1:
         return np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
-    here, ahead = np.argmax(abstract_state[..., AGENT]), OFFSETS_XY[direction]
-    heading = np.array([math.atan2(ahead[1], ahead[0])])
+    here, heading = np.argmax(abstract_state[..., AGENT]), WALK_HEADINGS[[direction]]
     return _views(abstract_state[..., WALL], np.array([here]), body, heading).reshape(GRID_SIZE, GRID_SIZE)
 
 

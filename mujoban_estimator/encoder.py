@@ -10,25 +10,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mujoban_core.camera import FRAME_SIZE
+from mujoban_rl.networks import PreActivatedBlock
 
 STRIDE: Final = 4
 """Pixels of a frame per row or column of the feature map."""
 FEATURE_SIZE: Final = FRAME_SIZE // STRIDE
 """H = W, rows and columns of the feature map."""
-
-
-class ResidualBlock(nn.Module):
-    """Two pre-activated convolutions beside an identity."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.first = nn.Conv2d(channels, channels, 3, padding=1)
-        self.second = nn.Conv2d(channels, channels, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return features of the same shape, [N, C, H, W]."""
-        y = self.second(self.first(torch.relu(x)).relu_())
-        return y.add_(x)  # in place, as no gradient needs what was there before
 
 
 class FrameEncoder(nn.Module):
@@ -40,10 +27,10 @@ class FrameEncoder(nn.Module):
         self.channels = channels
         self.layers = nn.Sequential(
             nn.Conv2d(3, stem, 4, stride=2, padding=1),
-            ResidualBlock(stem),
+            PreActivatedBlock(stem),
             nn.ReLU(inplace=True),
             nn.Conv2d(stem, channels, 4, stride=2, padding=1),
-            *(ResidualBlock(channels) for _ in range(blocks)),
+            *(PreActivatedBlock(channels) for _ in range(blocks)),
             nn.ReLU(inplace=True),
         ).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mujoban_core.bodies import BALL
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
-from mujoban_core.look_around import TURN_HEADINGS, WALKS
+from mujoban_core.look_around import TURN_HEADINGS, WALK_HEADINGS, WALKS
 from mujoban_core.visibility import cells_in_view
 from mujoban_planner.uncertainty import BORDER, guesses, visible
 from mujoban_rl.engine import State
@@ -25,8 +25,6 @@ from mujoban_rl.engine import State
 SHOWN: Final = 4
 """Channel of the cells that have been in view, behind those of the abstract state."""
 CHANNELS: Final = SHOWN + 1
-_HEADINGS: Final = np.arctan2(-OFFSETS_RC[:, 0].astype(float), OFFSETS_RC[:, 1].astype(float))
-"""Direction of travel of each instruction in radians; that of STAY is not used."""
 _CHANGING: Final = ("level", "agent", "seen", "guess", "steps")
 
 
@@ -123,7 +121,7 @@ class ExplorationEnvironment:
         blocked = self.level[every, row, column, WALL] | self.level[every, row, column, BOX]
         self.agent = np.where((moves & ~blocked)[:, None], ahead, self.agent)
         walked, looked = np.flatnonzero(moves), np.flatnonzero(~moves)
-        self.seen[walked] |= self._view(walked, _HEADINGS[action[walked]])
+        self.seen[walked] |= self._view(walked, WALK_HEADINGS[action[walked]])
         self._look(looked)
         self.steps += 1
         reward = config.cell * (self.seen.sum((1, 2)) - before) - np.where(moves, config.move, config.look)

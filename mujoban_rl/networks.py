@@ -140,6 +140,23 @@ class ResidualBlock(nn.Module):
         return functional.relu(y.add_(self.shortcut(x)), inplace=True)
 
 
+class PreActivatedBlock(nn.Module):
+    """Two 3x3 convolutions, each after a ReLU, beside the identity (He et al. 2016b, Espeholt et al. 2018)."""
+
+    def __init__(self, channels: int, gain: float = 1.0) -> None:
+        """Begin with the second convolution's weights times `gain`."""
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+        with torch.no_grad():
+            self.second.weight.mul_(gain)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [B, C, H, W] to the same."""
+        y = self.second(functional.relu(self.first(functional.relu(x)), inplace=True))
+        return y.add_(x)  # in place, as no gradient needs what was there before
+
+
 def frame_encoder(channels: Sequence[int], features: int, rows: int) -> nn.Sequential:
     """Return the ResNet from frames [B, 3, rows, 64] to features [B, F]; the last block keeps its resolution.
 
