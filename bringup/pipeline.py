@@ -2,7 +2,8 @@
 
 What is done stands in `pipeline.json` of the run's directory: for every stage its command, the digests of what it
 came from and of what it made, and the time that it took, by the clock and of the processor. A stage that was stopped is
-started again with the same command: every trainer of this project resumes from its directory.
+started again with the same command: every trainer of this project resumes from its directory. So is one whose products
+are gone where another needs them.
 """
 
 from __future__ import annotations
@@ -166,7 +167,8 @@ class Pipeline:
                 process runs the stages of this directory.
             Interrupted: If a signal came; the commands were stopped and have kept their checkpoints.
         """
-        with _alone(self.directory), StopSignal() as stop:
+        with self.alone(), StopSignal() as stop:
+            self._redo_what_is_gone()
             try:
                 while not self.done:
                     stop.check()
@@ -177,6 +179,33 @@ class Pipeline:
                     time.sleep(_PERIOD)
             finally:
                 self._stop_all()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other processes from running the stages of this run; the system frees it however this one ends.
+
+        Raises:
+            PipelineError: If another process runs them.
+        """
+        self.directory.mkdir(parents=True, exist_ok=True)
+        with (self.directory / "lock").open("ab") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise PipelineError(
+                    f"{self.directory}: another process runs its stages, expected another directory"
+                ) from None
+            yield
+
+    def _redo_what_is_gone(self) -> None:
+        """Take those stages for not done whose products are gone and wanted by one that is not done."""
+        wanted: set[str] = set()
+        for stage in reversed(self.stages):
+            entry = self.entries[stage.name]
+            if stage.name in wanted and not all(path.exists() for path in stage.products):
+                entry.done = False
+            if not entry.done:
+                wanted.update(stage.needs)
 
     def _start_ready(self) -> None:
         done = {name for name, entry in self.entries.items() if entry.done}
@@ -272,18 +301,6 @@ def _stored(file: Path) -> dict[str, Entry]:
         return {name: Entry(**entry) for name, entry in json.loads(file.read_text()).items()}
     except (ValueError, TypeError, AttributeError) as error:
         raise PipelineError(f"{file}: {error}; expected the record of a run as it was written") from error
-
-
-@contextmanager
-def _alone(directory: Path) -> Iterator[None]:
-    """Keep other processes from running the stages of a directory; the system frees it however this one ends."""
-    directory.mkdir(parents=True, exist_ok=True)
-    with (directory / "lock").open("ab") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise PipelineError(f"{directory}: another process runs its stages, expected another directory") from None
-        yield
 
 
 def _remove(paths: Sequence[Path]) -> None:

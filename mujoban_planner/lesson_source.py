@@ -137,6 +137,9 @@ class LessonSource(Source[Batch]):
         config, (demonstrations, corrections) = self._config, self._buffers.values()
         if demonstrations.added + corrections.added < self._due():
             self._add(self._pool.collect())
+        # A planner that has learned is corrected first, where its run begins anew.
+        while not demonstrations.added:
+            self._add(self._pool.collect())
         # A few corrections must not be learned by heart.
         corrected = int(config.batch_size * config.corrections * min(1.0, corrections.size / config.enough))
         parts = [demonstrations.draw(config.batch_size - corrected, self._rng)]
@@ -151,9 +154,9 @@ class LessonSource(Source[Batch]):
 
     def _due(self) -> float:
         """Return how many samples the lessons must have had; what is missing comes in lesson by lesson."""
-        config = self._config
-        stock, fresh = config.stock * config.batch_size, config.freshness * self.samples
-        return stock + fresh if self.samples <= stock else stock + config.enough + 2.0 * fresh
+        config, samples = self._config, self.samples - self.began
+        stock, fresh = config.stock * config.batch_size, config.freshness * samples
+        return stock + fresh if samples <= stock else stock + config.enough + 2.0 * fresh
 
     def _add(self, lesson: Experience) -> None:
         kind = next(iter(lesson.arrays)).partition(".")[0]

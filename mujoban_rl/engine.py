@@ -19,7 +19,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -116,6 +116,8 @@ class Source(_Part, Generic[BatchT]):
 
     samples: int = 0
     """Environment steps, or samples where there is no environment, so far: what learning curves are drawn against."""
+    began: int = 0
+    """Of these, those before it began: none, unless the run goes on from a light copy."""
 
     @abstractmethod
     def next_batch(self) -> BatchT | None:
@@ -159,6 +161,10 @@ class Cadence:
         ):
             if not count > 0:
                 raise ValueError(f"{verb} every {count} {unit}: expected a positive number")
+
+
+CARRIED: Final = ("progress", "metrics", "skipped")
+"""What a light copy of a checkpoint holds beside its modules (see `mujoban_rl.run_directory.copy_light`)."""
 
 
 class Trainer(Generic[BatchT]):
@@ -329,6 +335,7 @@ class Trainer(Generic[BatchT]):
                 "progress": vars(self.progress),
                 "metrics": self.metrics,
                 "skipped": self._guard.skipped,
+                "began": self.source.began,
                 **state.values,
             },
             tensors=state.tensors,
@@ -348,12 +355,14 @@ class Trainer(Generic[BatchT]):
             self.progress = Progress(**snapshot.extra["progress"])
             self.metrics = snapshot.extra["metrics"]
             self._guard.skipped = snapshot.extra["skipped"]
-            state = State(snapshot.extra, snapshot.tensors)
-            for name, part in parts.items():
-                part.restore(state.part(name))
-            published = state.part("published")
-            self._published, self._version = published.tensors, published.values["version"]
+            if not snapshot.light:
+                state = State(snapshot.extra, snapshot.tensors)
+                for name, part in parts.items():
+                    part.restore(state.part(name))
+                published = state.part("published")
+                self._published, self._version = published.tensors, published.values["version"]
         self.source.samples = self.progress.samples
+        self.source.began = self.progress.samples if snapshot.light else snapshot.extra.get("began", 0)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +20,7 @@ from mujoban_core.files import digest, naming, replacing_alone, write_atomically
 from mujoban_rl.weights import check_finite
 
 _ANOTHER = "choose another directory"
+_CONFIG: Final = "config.json"
 _SYSTEM_ERROR: Final = re.compile(r"\(os error (\d+)\)")
 
 
@@ -36,6 +37,8 @@ class Snapshot:
     """JSON values: random states, schedules, counters."""
     tensors: dict[str, Tensor]
     """Loose tensors, such as `torch.Generator` states."""
+    light: bool = False
+    """Whether it holds modules and `extra` alone (see `copy_light`)."""
 
 
 class RunDirectory:
@@ -64,7 +67,7 @@ class RunDirectory:
         fields = dataclasses.asdict(config) if dataclasses.is_dataclass(config) else dict(config)  # type: ignore[arg-type]
         self.config: dict[str, Any] = json.loads(json.dumps(fields, default=str))
         self.path.mkdir(parents=True, exist_ok=True)
-        file = self.path / "config.json"
+        file = self.path / _CONFIG
         if file.exists() and any(other != file for other in self.path.iterdir()):
             stored = _read_config(file)
             changed = sorted(k for k in stored.keys() | self.config.keys() if stored.get(k) != self.config.get(k))
@@ -136,6 +139,8 @@ class RunDirectory:
     ) -> Snapshot | None:
         """Restore the newest intact checkpoint in place; return None when there is no checkpoint.
 
+        A light one leaves optimisers as they are.
+
         Raises:
             RunError: If there are checkpoints but none is intact, or they are of another kind of run.
         """
@@ -148,11 +153,12 @@ class RunDirectory:
             with self.reading(content.get("step")):
                 for name, module in modules.items():
                     module.load_state_dict(_below(flat, f"module/{name}/"))
-                for name, optimiser in (optimisers or {}).items():
+                light = content.get("light", False)
+                for name, optimiser in ({} if light else optimisers or {}).items():
                     state = _join_optimiser(_below(flat, f"optimiser/{name}/"), content["optimisers"][name])
                     optimiser.load_state_dict(state)
                     _lay_out(optimiser)
-                return Snapshot(content["step"], content["extra"], _below(flat, "tensor/"))
+                return Snapshot(content["step"], content["extra"], _below(flat, "tensor/"), light)
         if candidates:
             raise RunError(f"{self.path}: none of {len(candidates)} checkpoints is intact")
         return None
@@ -174,7 +180,48 @@ class RunDirectory:
             ) from error
 
     def _checkpoints(self) -> list[Path]:
-        return sorted(self.path.glob("checkpoint-*.safetensors"), reverse=True)
+        return _newest_first(self.path)
+
+
+def copy_light(run: Path, out: Path, extra: Collection[str]) -> Path | None:
+    """Write a light copy of a run's newest intact checkpoint: its modules at half precision, and some of `extra`.
+
+    A run that goes on from it begins anew with its optimisers and with all that it has gathered, which may be a
+    thousand times as large: to carry a run elsewhere, not to go on as one that never stopped.
+
+    Args:
+        run: Directory of the run.
+        out: Directory that gets the copy and the run's configuration; it is made if it does not exist.
+        extra: Names of the values to keep.
+
+    Returns:
+        Path of its safetensors file; None if the run has no checkpoint.
+
+    Raises:
+        RunError: If it has checkpoints but none is intact.
+    """
+    candidates = _newest_first(run)
+    for path in candidates:
+        if (loaded := _read_checkpoint(path)) is None:
+            continue
+        content, flat = loaded
+        modules = {k: v.half() if v.is_floating_point() else v for k, v in flat.items() if k.startswith("module/")}
+        check_finite(modules, f"light copy of {path}")
+        kept = {name: content["extra"][name] for name in extra}
+        out.mkdir(parents=True, exist_ok=True)
+        write_atomically(out / _CONFIG, (run / _CONFIG).read_bytes())
+        target = out / path.name
+        _save(modules, target)
+        light = {"step": content["step"], "light": True, "extra": kept, "digest": digest(target)}
+        write_atomically(target.with_suffix(".json"), json.dumps(light).encode())
+        return target
+    if candidates:
+        raise RunError(f"{run}: none of {len(candidates)} checkpoints is intact")
+    return None
+
+
+def _newest_first(directory: Path) -> list[Path]:
+    return sorted(directory.glob("checkpoint-*.safetensors"), reverse=True)
 
 
 def _read_config(file: Path) -> dict[str, Any]:

@@ -21,8 +21,9 @@ import torch
 from torch import Tensor
 
 from mujoban_core.signals import Interrupted
-from mujoban_rl.engine import Learner, Source, Trainer
+from mujoban_rl.engine import CARRIED, Learner, Source, Trainer
 from mujoban_rl.limits import NaNGuard
+from mujoban_rl.run_directory import copy_light
 
 BatchT = TypeVar("BatchT")
 
@@ -46,6 +47,8 @@ def differing(one: dict[str, Tensor], other: dict[str, Tensor]) -> list[str]:
 def check_resuming(make: Callable[[Path], Trainer[Any]], folder: Path, *, stop_at: int, updates: int) -> None:
     """Check that a run that SIGTERM stops leaves a checkpoint, from which it ends as one that never stopped.
 
+    From a light copy of it, it goes on with the same weights, and gathers anew what it learns from.
+
     Args:
         make: Opens or resumes the run in a directory.
         folder: Receives the runs.
@@ -64,6 +67,7 @@ def check_resuming(make: Callable[[Path], Trainer[Any]], folder: Path, *, stop_a
         pass
     else:
         raise AssertionError("a run that was stopped ends as if it were not")
+    copy_light(folder / "parts", folder / "light", CARRIED)
     resumed = make(folder / "parts")
     assert resumed.progress.updates == stop_at, f"resumed at update {resumed.progress.updates}, stopped at {stop_at}"
     resumed.run(limit_updates=updates)
@@ -72,6 +76,10 @@ def check_resuming(make: Callable[[Path], Trainer[Any]], folder: Path, *, stop_a
     for one, other in ((whole.learner, resumed.learner), (whole.source, resumed.source)):
         assert not (names := differing(tensors_of(one), tensors_of(other))), f"after resuming differ: {names}"
         assert one.state().values == other.state().values
+    carried = make(folder / "light")
+    before = carried.progress.samples
+    carried.run(limit_updates=updates)
+    assert carried.progress.updates == updates and carried.progress.samples > before > 0
 
 
 def _terminate_at(trainer: Trainer[Any], update: int) -> None:

@@ -77,7 +77,7 @@ class ActorSource(Source[BatchT], Generic[BatchT]):
         Raises:
             ActorError: If an actor raised an error, or dies again and again.
         """
-        due = self._first + self._ratio * (self._updates + 1)
+        due = self.began + self._first + self._ratio * (self._updates + 1)
         while self.samples < due or (batch := self.store.sample()) is None:
             self._add(self.pool.collect())
         self._updates += 1

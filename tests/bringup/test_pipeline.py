@@ -194,3 +194,16 @@ def test_two_runs_of_one_directory_are_refused(tmp_path):
 def test_a_need_that_is_no_earlier_stage_is_refused(tmp_path):
     with pytest.raises(PipelineError, match="stage second needs first"):
         Pipeline(tmp_path, stages(tmp_path)[1:])
+
+
+def test_what_is_gone_is_made_again_where_a_stage_needs_it_and_only_there(tmp_path):
+    a, b = tmp_path / "a.txt", tmp_path / "b.txt"
+    Pipeline(tmp_path, stages(tmp_path)).run()
+    a.unlink()
+    Pipeline(tmp_path, stages(tmp_path)).run()
+    assert not a.exists() and b.read_text() == "ab"
+    c = tmp_path / "c.txt"
+    third = Stage("third", ("-c", COPY, str(b), str(c)), (c,), needs=("second",))
+    b.unlink()
+    Pipeline(tmp_path, [*stages(tmp_path), third]).run()
+    assert c.read_text() == "abb" and a.exists()

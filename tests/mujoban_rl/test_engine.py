@@ -11,10 +11,10 @@ import torch
 from torch import nn
 
 from mujoban_core.signals import Interrupted
-from mujoban_rl.engine import Budget, Cadence, Learner, Source, State, Trainer
+from mujoban_rl.engine import CARRIED, Budget, Cadence, Learner, Source, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
-from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.run_directory import RunDirectory, RunError, copy_light
 
 CADENCE = Cadence(log_updates=2, evaluate_samples=40, save_seconds=math.inf)
 
@@ -228,3 +228,24 @@ def test_a_source_without_more_ends_the_run(tmp_path):
 def test_a_budget_that_is_no_amount_is_refused():
     with pytest.raises(ValueError, match="0 samples: expected a positive number"):
         Budget(samples=0)
+
+
+def test_a_run_goes_on_elsewhere_from_a_light_copy_with_its_networks_and_what_it_has_spent(tmp_path):
+    here = trainer(tmp_path / "here")
+    here.run(limit_samples=120)
+    copy_light(tmp_path / "here", tmp_path / "there", CARRIED)
+    there = trainer(tmp_path / "there")
+    assert vars(there.progress) == vars(here.progress)
+    for name, tensor in weights(here).items():
+        torch.testing.assert_close(weights(there)[name], tensor, rtol=1e-3, atol=1e-6)
+    assert not there.learner.adam.state and there.source.batches == 0
+    assert there.run() and there.progress.samples == 200
+
+
+def test_a_light_copy_of_what_is_not_intact_is_refused(tmp_path):
+    trainer(tmp_path / "run").run(limit_samples=40)
+    for file in (tmp_path / "run").glob("checkpoint-*.safetensors"):
+        file.write_bytes(b"half")
+    with pytest.raises(RunError, match="none of 1 checkpoints is intact"):
+        copy_light(tmp_path / "run", tmp_path / "copy", CARRIED)
+    assert copy_light(tmp_path / "empty", tmp_path / "copy", CARRIED) is None
