@@ -1,8 +1,9 @@
 """Judge the controller: `python -m mujoban_controller.evaluate --episodes 512 --seed 1000`.
 
 Whole episodes of a solver's plans with exact termination signals, or random instructions of every kind with
-`--instructions random`; prints JSON. `--driver` compares the camera policy
-with the scripted driver or a privileged teacher under the same judgement, which shows the loss from distillation.
+`--instructions random`, or how far it turns while it is told to stay with `--instructions stay`; prints JSON.
+`--driver` compares the camera policy with the scripted driver or a privileged teacher under the same judgement, which
+shows the loss from distillation.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from mujoban_controller.drivers import Driver
 from mujoban_controller.judge import judge
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
+from mujoban_controller.turning import judge_turning
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_file, digest
 from mujoban_core.program import read_options, run_command
@@ -43,8 +45,9 @@ class Options:
 
     driver: Literal["camera", "teacher", "scripted"] = "camera"
     """Camera policy, privileged policy or scripted driver."""
-    instructions: Literal["plans", "random"] = "plans"
-    """A solver's plans, or random moves, pushes, stays, and instructions towards walls and blocked boxes."""
+    instructions: Literal["plans", "random", "stay"] = "plans"
+    """A solver's plans; random moves, pushes, stays, and instructions towards walls and blocked boxes; or stays
+    alone."""
     weights: Path | None = None
     """Weights of camera policy or teacher; those that ship by default."""
     episodes: int = 128
@@ -87,11 +90,15 @@ def main(command_line: Sequence[str] | None = None) -> int:
     check_file("--json", options.json)
     set_threads(options.threads)
     driver, identity = make_driver(options)
-    report = judge(
-        driver, OraclePlanner(), episodes=options.episodes, first_seed=options.seed, difficulty=options.difficulty,
-        body=options.body, world=options.world, batch=options.batch, threads=options.threads,
-        plans=options.instructions == "plans",
-    )  # fmt: skip
+    levels: dict[str, Any] = {
+        "episodes": options.episodes, "first_seed": options.seed, "difficulty": options.difficulty,
+        "body": options.body, "world": options.world, "threads": options.threads,
+    }  # fmt: skip
+    if options.instructions == "stay":
+        report = judge_turning(driver, **levels)
+    else:
+        plans = options.instructions == "plans"
+        report = judge(driver, OraclePlanner(), **levels, batch=options.batch, plans=plans)
     told: dict[str, Any] = {
         "weights": {"controller": identity}, "world": options.world, "n": options.episodes, "seed": options.seed,
     }  # fmt: skip

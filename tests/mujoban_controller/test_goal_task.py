@@ -16,6 +16,7 @@ from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.instructions import EXACT, InstructionConfig
 from mujoban_controller.judge import failure_name, judge
 from mujoban_controller.scripted import scripted_driver
+from mujoban_controller.turning import judge_turning
 from mujoban_core.bodies import BALL
 from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction
 from mujoban_core.interfaces import Planner
@@ -172,6 +173,15 @@ def test_random_instructions_judge_every_kind():
 def test_controllers_and_drivers_are_judged_alike():
     report = judge(ControllerDriver(OracleController()), OraclePlanner(), episodes=2, first_seed=7, difficulty=1)
     assert report["success_rate"] == 1.0
+
+
+def test_it_is_judged_how_far_a_robot_turns_while_it_is_told_to_stay():
+    def spin(task):
+        return np.tile(np.float32(BALL.turn), (len(task.torque), 1))
+
+    turning, standing = (judge_turning(driver, episodes=4, first_seed=7)["turned"] for driver in (spin, scripted_driver))
+    assert turning["20"]["slowest"] > 45.0 and turning["40"]["median"] > turning["20"]["median"]
+    assert standing["120"]["median"] < 10.0 and standing["120"]["off_middle"] < 0.1
 
 
 def test_what_failed_is_tried_again_from_where_it_began():
