@@ -39,8 +39,8 @@ class LearnerConfig:
 
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     termination: TerminationConfig = field(default_factory=TerminationConfig)
-    window_frames: int = 128
-    """Frames of a step from which termination learns, beside those of the estimator."""
+    window_frames: int = 40
+    """Frames of a step from which termination learns, beside those of the estimator, which has more to learn."""
     window_length: int = 64
     """Most ticks of an instruction that it learns from."""
     unseen: float = 0.1
