@@ -25,6 +25,10 @@ from mujoban_sim.goals import GoalKind
 _REACH = 0.6
 """Distance in cells from the robot to the box that it pushes, beyond which it is told to come nearer."""
 
+_PLACE = 0.3
+"""Distance in cells from the middle at which turning earns nothing. It earns less the farther off the robot is, and
+not only where STAY ends: a robot that had stopped at that edge would lose all by its first step."""
+
 
 @dataclass(frozen=True)
 class RewardConfig:
@@ -54,8 +58,8 @@ class RewardConfig:
     tilt: float = 0.1
     """Cost of a tick in which the robot lies on its side."""
     turn: float = 5.0
-    """Of each radian by which a robot that is to hold turns to its left in its place, where no single action turns it:
-    a gait has to earn more than it costs in torques, also while it is still slow."""
+    """Of each radian by which a robot that is to hold turns to its left in the middle of its cell, where no single
+    action turns it: a gait has to earn more than it costs in torques, also while it is still slow."""
     fastest_turn: float = 2.0
     """Radians per second beyond which turning faster earns no more."""
     backwards: float = 0.0
@@ -120,7 +124,7 @@ class GoalReward:
         reward += c.completed * completed + c.failed * failed
         if body.turn is None:
             stayed = completed & (world.goals.direction == Instruction.STAY)
-            reward += self._turning(world) * completed - c.completed * stayed
+            reward += self._turning(world) - c.completed * stayed
         reward -= c.drift * (drift(world) - drifted)
         reward -= c.time + c.effort * np.square(change).sum(1) + c.tilt * (1.0 - upright(world))
         reward -= c.heading * self._off_course(world)
@@ -136,7 +140,9 @@ class GoalReward:
         at, c = world.body.proprio, self.config
         rate = (world.proprio[:, at.angular_velocity] * world.proprio[:, at.up_axis]).sum(1)
         turned = np.clip(rate, -c.fastest_turn, c.fastest_turn) * CONTROL_PERIOD
-        return c.turn * turned * (world.goals.kind == GoalKind.HOLD)
+        off = np.hypot(*(world.goals.robot_target - world.pose[:, :2]).T) / world.body.cell_size
+        placed = np.maximum(1.0 - off / _PLACE, 0.0)
+        return c.turn * turned * placed * (world.goals.kind == GoalKind.HOLD)
 
     def _off_course(self, world: GoalView) -> NDArray[np.float64]:
         """Return 0 where a side looks along the instruction, up to 1 halfway between two, [B]."""

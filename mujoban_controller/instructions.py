@@ -28,7 +28,7 @@ class InstructionConfig:
 
     stay: float = 0.05
     """Share of stay."""
-    stays_on: float = 0.97
+    stays_on: float = 0.985
     """Chance that a stay is followed by another, as in a look around, for a body that learns to turn."""
     infeasible: float = 0.05
     """Share of instructions towards walls and blocked boxes, where there are any."""

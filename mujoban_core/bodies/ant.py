@@ -81,4 +81,5 @@ ANT: Final = Body(
     time_limit=2 * TIME_LIMIT,
     camera=_CAMERA,
     mjcf=_MJCF,
+    look_ticks=50,
 )

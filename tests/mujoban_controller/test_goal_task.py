@@ -179,7 +179,8 @@ def test_it_is_judged_how_far_a_robot_turns_while_it_is_told_to_stay():
     def spin(task):
         return np.tile(np.float32(BALL.turn), (len(task.torque), 1))
 
-    turning, standing = (judge_turning(driver, episodes=4, first_seed=7)["turned"] for driver in (spin, scripted_driver))
+    drivers = (spin, scripted_driver)
+    turning, standing = (judge_turning(driver, episodes=4, first_seed=7)["turned"] for driver in drivers)
     assert turning["20"]["slowest"] > 45.0 and turning["40"]["median"] > turning["20"]["median"]
     assert standing["120"]["median"] < 10.0 and standing["120"]["off_middle"] < 0.1
 
@@ -205,11 +206,12 @@ def test_settings_that_contradict_the_evaluation_are_refused():
         judging_config(4, difficulty=9)
 
 
-def turning_is_worth(body, in_place=True):
-    """Return what a tick in which the robot turns to its left at 1 rad/s is worth more than one at rest."""
+def turning_is_worth(body, off=0.0):
+    """Return what turning to the left at 1 rad/s adds to a tick's reward, so many cells off the middle."""
     settings = InstructionConfig(stay=1.0)
     task = make(body=body, planned=0.0, misaligned=0.0, instructions=settings, terminations=EXACT)
-    world, ends, reward = task.world, np.array([[in_place] * 4, [False] * 4]), GoalReward(RewardConfig())
+    world, ends, reward = task.world, np.zeros((2, 4), np.bool_), GoalReward(RewardConfig())
+    world.pose[:, :2] = world.goals.robot_target + np.array([off * world.body.cell_size, 0.0])
     there, still = reward.before(world), np.zeros((4, world.body.action_size), np.float32)
     at = world.body.proprio
     world.proprio[:, at.up_axis] = 0.0, 0.0, 1.0
@@ -224,8 +226,9 @@ def turning_is_worth(body, in_place=True):
 
 def test_to_turn_is_rewarded_where_no_single_action_does_it():
     assert turning_is_worth("ball") == pytest.approx(np.zeros(4))
-    assert turning_is_worth("ant") == pytest.approx(np.full(4, RewardConfig().turn * CONTROL_PERIOD), abs=1e-5)
-    assert turning_is_worth("ant", in_place=False) == pytest.approx(np.zeros(4)), "a look begins where a STAY has ended"
+    most = RewardConfig().turn * CONTROL_PERIOD
+    for off, share in ((0.0, 1.0), (0.15, 0.5), (0.5, 0.0)):
+        assert turning_is_worth("ant", off) == pytest.approx(np.full(4, share * most), abs=1e-5)
 
 
 @pytest.mark.parametrize(("stays_on", "least", "most"), [(1.0, 1.0, 1.0), (0.0, 0.0, 0.5)])
