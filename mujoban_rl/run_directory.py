@@ -184,7 +184,7 @@ class RunDirectory:
 
 
 def copy_light(run: Path, out: Path, extra: Collection[str]) -> Path | None:
-    """Write a light copy of a run's newest intact checkpoint: its modules at half precision, and some of `extra`.
+    """Write a light copy of a run's newest intact checkpoint: its modules, matrices at half precision, some of `extra`.
 
     A run that goes on from it begins anew with its optimisers and with all that it has gathered, which may be a
     thousand times as large: to carry a run elsewhere, not to go on as one that never stopped.
@@ -205,7 +205,7 @@ def copy_light(run: Path, out: Path, extra: Collection[str]) -> Path | None:
         if (loaded := _read_checkpoint(path)) is None:
             continue
         content, flat = loaded
-        modules = {k: v.half() if v.is_floating_point() else v for k, v in flat.items() if k.startswith("module/")}
+        modules = {k: _halved(v) for k, v in flat.items() if k.startswith("module/")}
         check_finite(modules, f"light copy of {path}")
         kept = {name: content["extra"][name] for name in extra}
         out.mkdir(parents=True, exist_ok=True)
@@ -218,6 +218,11 @@ def copy_light(run: Path, out: Path, extra: Collection[str]) -> Path | None:
     if candidates:
         raise RunError(f"{run}: none of {len(candidates)} checkpoints is intact")
     return None
+
+
+def _halved(values: Tensor) -> Tensor:
+    """Return a matrix of weights at half precision, and as it is what is small and may be large in value: counts."""
+    return values.half() if values.is_floating_point() and values.dim() > 1 else values
 
 
 def _newest_first(directory: Path) -> list[Path]:

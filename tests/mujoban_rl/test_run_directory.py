@@ -8,12 +8,13 @@ import sys
 import pytest
 import torch
 from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import nn
 
 from mujoban_core.stats import wilson_interval
 from mujoban_rl import run_directory
 from mujoban_rl.limits import NaNGuard, TimeLimit
-from mujoban_rl.run_directory import RunDirectory, RunError
+from mujoban_rl.run_directory import RunDirectory, RunError, copy_light
 from mujoban_rl.weights import WeightsError, load_weights, record_path, save_weights
 
 
@@ -135,6 +136,19 @@ def test_only_the_last_checkpoints_are_kept_and_nan_is_never_written(tmp_path):
     with pytest.raises(WeightsError, match=r"layer\.bias"):
         run.save(4, modules={"net": net})
     assert not (tmp_path / "checkpoint-0000000004.safetensors").exists()
+
+
+def test_a_light_copy_halves_matrices_and_keeps_counts_as_they_are(tmp_path):
+    nets = [Net(), Net()]
+    for net, count in zip(nets, (1e6, 0.0), strict=True):
+        net.register_buffer("count", torch.tensor(count))
+    RunDirectory(tmp_path / "run", {}).save(3, modules={"net": nets[0]}, extra={"a": 1, "b": 2})
+    copy = copy_light(tmp_path / "run", tmp_path / "copy", ["a"])
+    snapshot = RunDirectory(tmp_path / "copy", {}).load(modules={"net": nets[1]})
+    assert copy is not None and snapshot is not None and snapshot.light and snapshot.extra == {"a": 1}
+    assert load_file(copy)["module/net/layer.weight"].dtype == torch.float16
+    assert nets[1].count == 1e6
+    torch.testing.assert_close(nets[1].layer.weight, nets[0].layer.weight, rtol=1e-3, atol=1e-6)
 
 
 def test_run_directory_refuses_another_configuration_once_something_was_done(tmp_path):
