@@ -167,6 +167,8 @@ def _one_line(box: str) -> str:
         return f"{empty[1]} has no value, expected one"
     # How tyro names what a subcommand's options are made of.
     wrong = re.sub(r"^(?:--)?__tyro-dummy-inner__\.(?:\w+\.)*\w+: ", "", wrong)
+    # And whose check of all options together it is that failed.
+    wrong = re.sub(r"^\w+: (?=--)", "", wrong)
     if "xpected" in wrong:
         return re.sub(r"^(--[\w-]+): ", r"\1 ", wrong[0].lower() + wrong[1:])
     if missing := re.match(r".*[Mm]issing from .*?: (--\S+)", wrong):

@@ -81,6 +81,19 @@ def test_what_an_option_of_a_subcommand_rejects_is_said_in_its_own_words():
         read_options({"one": Options, "two": Options}, ["one", "--settings.reuse", "0"], "program")
 
 
+def test_what_all_options_together_reject_begins_with_the_option():
+    @dataclass
+    class Options:
+        hours: float = 1.0
+
+        def __post_init__(self):
+            if self.hours <= 0:
+                raise ValueError(f"--hours {self.hours}: expected more than 0")
+
+    with pytest.raises(ValueError, match=r"^--hours 0\.0: expected more than 0$"):
+        read_options(Options, ["--hours", "0"], "program")
+
+
 def test_an_option_of_many_subcommands_is_proposed_once():
     @dataclass
     class Options:
