@@ -17,6 +17,7 @@ from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.judge import OutcomeSummary
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import Memory, Planner
+from mujoban_sim.driving import wrap_angles
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import VALIDATION_SEEDS
 
@@ -73,7 +74,7 @@ def judge_turning(
     for tick in range(1, TICKS[-1] + 1):
         summary.add(task.step(driver(task)).outcomes)
         before, pose = pose, task.world.pose.copy()
-        turned += np.angle(np.exp(1j * (pose[:, 2] - before[:, 2])))
+        turned += wrap_angles(pose[:, 2] - before[:, 2])
         if tick in TICKS:
             degrees = np.degrees(np.abs(turned))
             off = np.linalg.norm(pose[:, :2] - start, axis=1) / task.world.body.cell_size
