@@ -39,21 +39,19 @@ class Options:
     out: Path
     """Directory that gets the copy; one that does not exist."""
 
-    def __post_init__(self) -> None:
-        """Reject what is no run, and a copy over another."""
-        if not (self.run / "pipeline.json").exists():
-            raise ValueError(f"--run {self.run}: no pipeline.json, expected the directory of a run of make weights")
-        if self.out.exists():
-            raise ValueError(f"--out {self.out}: exists, expected a directory to make")
-
 
 def carry(run: Path, out: Path) -> None:
     """Copy a run.
 
     Raises:
+        ValueError: If there is no run, or something where the copy is to be.
         PipelineError: If its record is damaged, or its stages run.
         RunError: If a training under way has no intact checkpoint.
     """
+    if not (run / "pipeline.json").exists():
+        raise ValueError(f"--run {run}: no pipeline.json, expected the directory of a run of make weights")
+    if out.exists():
+        raise ValueError(f"--out {out}: exists, expected a directory to make")
     pipeline = Pipeline.read(run)
     with pipeline.alone():
         recordings = {name for name, entry in pipeline.entries.items() if _RECORDING in entry.command}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from bringup.carry import Options, carry, main
+from bringup.carry import carry, main
 from bringup.pipeline import Pipeline, PipelineError
 from mujoban_rl.run_directory import RunDirectory
 
@@ -57,6 +57,6 @@ def test_a_run_whose_stages_run_is_not_copied(run, tmp_path):
 
 def test_what_is_no_run_and_a_copy_over_another_are_refused(run, tmp_path):
     with pytest.raises(ValueError, match=r"no pipeline\.json, expected the directory of a run"):
-        Options(tmp_path, tmp_path / "out")
+        carry(tmp_path, tmp_path / "out")
     with pytest.raises(ValueError, match="exists, expected a directory to make"):
-        Options(run, run)
+        carry(run, run)

@@ -19,6 +19,7 @@ from bringup import evaluate, record, run_stack, train
 from bringup.command import Stack, recorded_seed
 from bringup.options import EpisodeOptions
 from bringup.reporting import Reporting, played
+from mujoban_core.bodies import ANT
 from mujoban_core.files import digest
 from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
@@ -97,7 +98,7 @@ def test_a_report_says_what_was_played(tmp_path):
     searching = Stack(deliberation=Deliberation(look_ahead=400, certainty=0.8), body="ant")
     told = played(searching, Episodes(1, 0), EpisodeOptions(body="ant"))
     assert told["look_ahead"] == 400 and told["look_ahead_certainty"] == 0.8
-    assert told["look_around"] == 0 and told["time_limit"] == 9600
+    assert told["look_around"] == ANT.look_ticks and told["time_limit"] == 9600
 
 
 def test_a_summary_on_the_terminal_names_lost_seeds_by_cause(capfd):
