@@ -144,24 +144,18 @@ class RunDirectory:
         Raises:
             RunError: If there are checkpoints but none is intact, or they are of another kind of run.
         """
-        candidates = self._checkpoints()
-        for path in candidates:
-            loaded = _read_checkpoint(path)
-            if loaded is None:
-                continue
-            content, flat = loaded
-            with self.reading(content.get("step")):
-                for name, module in modules.items():
-                    module.load_state_dict(_below(flat, f"module/{name}/"))
-                light = content.get("light", False)
-                for name, optimiser in ({} if light else optimisers or {}).items():
-                    state = _join_optimiser(_below(flat, f"optimiser/{name}/"), content["optimisers"][name])
-                    optimiser.load_state_dict(state)
-                    _lay_out(optimiser)
-                return Snapshot(content["step"], content["extra"], _below(flat, "tensor/"), light)
-        if candidates:
-            raise RunError(f"{self.path}: none of {len(candidates)} checkpoints is intact")
-        return None
+        if (found := _newest_intact(self.path)) is None:
+            return None
+        _, content, flat = found
+        with self.reading(content.get("step")):
+            for name, module in modules.items():
+                module.load_state_dict(_below(flat, f"module/{name}/"))
+            light = content.get("light", False)
+            for name, optimiser in ({} if light else optimisers or {}).items():
+                state = _join_optimiser(_below(flat, f"optimiser/{name}/"), content["optimisers"][name])
+                optimiser.load_state_dict(state)
+                _lay_out(optimiser)
+            return Snapshot(content["step"], content["extra"], _below(flat, "tensor/"), light)
 
     @contextmanager
     def reading(self, step: int | None) -> Iterator[None]:
@@ -200,29 +194,39 @@ def copy_light(run: Path, out: Path, extra: Collection[str]) -> Path | None:
     Raises:
         RunError: If it has checkpoints but none is intact.
     """
-    candidates = _newest_first(run)
-    for path in candidates:
-        if (loaded := _read_checkpoint(path)) is None:
-            continue
-        content, flat = loaded
-        modules = {k: _halved(v) for k, v in flat.items() if k.startswith("module/")}
-        check_finite(modules, f"light copy of {path}")
-        kept = {name: content["extra"][name] for name in extra}
-        out.mkdir(parents=True, exist_ok=True)
-        write_atomically(out / _CONFIG, (run / _CONFIG).read_bytes())
-        target = out / path.name
-        _save(modules, target)
-        light = {"step": content["step"], "light": True, "extra": kept, "digest": digest(target)}
-        write_atomically(target.with_suffix(".json"), json.dumps(light).encode())
-        return target
-    if candidates:
-        raise RunError(f"{run}: none of {len(candidates)} checkpoints is intact")
-    return None
+    if (found := _newest_intact(run)) is None:
+        return None
+    path, content, flat = found
+    modules = {k: _halved(v) for k, v in flat.items() if k.startswith("module/")}
+    check_finite(modules, f"light copy of {path}")
+    kept = {name: content["extra"][name] for name in extra}
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomically(out / _CONFIG, (run / _CONFIG).read_bytes())
+    target = out / path.name
+    _save(modules, target)
+    light = {"step": content["step"], "light": True, "extra": kept, "digest": digest(target)}
+    write_atomically(target.with_suffix(".json"), json.dumps(light).encode())
+    return target
 
 
 def _halved(values: Tensor) -> Tensor:
     """Return a matrix of weights at half precision, and as it is what is small and may be large in value: counts."""
     return values.half() if values.is_floating_point() and values.dim() > 1 else values
+
+
+def _newest_intact(directory: Path) -> tuple[Path, dict[str, Any], dict[str, Tensor]] | None:
+    """Return path, JSON and tensor parts of the newest checkpoint that is not damaged; None if there is none at all.
+
+    Raises:
+        RunError: If there are checkpoints but none is intact.
+    """
+    candidates = _newest_first(directory)
+    for path in candidates:
+        if (loaded := _read_checkpoint(path)) is not None:
+            return path, *loaded
+    if candidates:
+        raise RunError(f"{directory}: none of {len(candidates)} checkpoints is intact")
+    return None
 
 
 def _newest_first(directory: Path) -> list[Path]:
