@@ -5,13 +5,14 @@ Searches run in actors (`search_lessons`); who learns from them is the learner o
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+import math
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
-from mujoban_planner.imitation import ImitationLearner, LearnerConfig
+from mujoban_planner.imitation import ImitationLearner, LearnerConfig, recorded
 from mujoban_planner.samples import Batch
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
 from mujoban_rl.actors import ActorOptions, ActorSource
@@ -43,6 +44,8 @@ class ExpertIterationConfig(LearnerConfig):
     cpu_seconds: float = 10_800.0
     """CPU seconds after which the run is complete; the learning rate falls until then. Two cores have so many in 90
     minutes."""
+    horizon_seconds: float = math.inf
+    """Wall-clock seconds after which it is complete, whichever comes first: the measure where a GPU computes."""
     updates: float = 1e9
     """Updates after which it is complete."""
 
@@ -51,12 +54,15 @@ class ExpertIterationConfig(LearnerConfig):
         super().__post_init__()
         check_counts(self, "channels", "blocks", "first_evaluations")
         check_positive(self, "evaluations", "learning_rate")
+        if not self.horizon_seconds > 0.0:
+            raise ValueError(f"--horizon-seconds {self.horizon_seconds}: expected a positive number")
         check_shares(self, "warm_up")
 
 
 def expert_iteration(
-    config: ExpertIterationConfig, directory: Path, cadence: Cadence | None = None, actors: ActorOptions | None = None
-) -> Trainer[Batch]:
+    config: ExpertIterationConfig, directory: Path, cadence: Cadence | None = None,
+    actors: ActorOptions | None = None, *, device: str = "cpu",
+) -> Trainer[Batch]:  # fmt: skip
     """Open or resume a run.
 
     Args:
@@ -64,12 +70,14 @@ def expert_iteration(
         directory: Run directory.
         cadence: How often it evaluates and saves.
         actors: Where searches run.
+        device: Device of the networks, of the learner and of those who search.
 
     Raises:
         RunError: If the directory belongs to another run.
     """
+    searcher = partial(SearchActor, config.network, config.search, config.seed, device=device)
     source = ActorSource(
-        (actors or ActorOptions()).pool(partial(SearchActor, config.network, config.search, config.seed)),
+        (actors or ActorOptions()).pool(searcher),
         LessonStore(config.search, config.seed),
         steps_per_update=config.evaluations * config.search.batch_size,
         first_steps=config.first_evaluations,
@@ -77,10 +85,10 @@ def expert_iteration(
     record = {
         **provenance(),
         "method": "expert-iteration",
-        "training": asdict(config),
+        "training": recorded(config),
         "init": origin(config.init),
         "data": lineage(_DATA, config.init),
     }
-    budget = Budget(cpu_seconds=config.cpu_seconds, updates=config.updates)
+    budget = Budget(cpu_seconds=config.cpu_seconds, seconds=config.horizon_seconds, updates=config.updates)
     run = RunDirectory(directory, config)
-    return Trainer(run, ImitationLearner(config), source, budget, cadence, record=record)
+    return Trainer(run, ImitationLearner(config, device), source, budget, cadence, record=record)

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from mujoban_planner.boards import BitBoards, signed
-from mujoban_planner.forest_kernels import Trees, expand, judge, plant, pop, question
+from mujoban_planner.forest_kernels import Trees, expand, judge, plant, pop, question, wander
 from mujoban_rl.engine import State
 
 _BRANCHING: Final = 12
@@ -97,8 +97,7 @@ class Forest:
         """Take the cheapest node out of each of R trees that are open; return nodes, [R], and states."""
         nodes = np.empty(len(rows), np.int64)
         pop(self.trees, rows, nodes)
-        trees = self.trees
-        return nodes, BitBoards(trees.wall[rows], trees.target[rows], trees.box[rows, nodes], trees.agent[rows, nodes])
+        return nodes, self.boards(rows, nodes)
 
     def expand(
         self,
@@ -116,6 +115,20 @@ class Forest:
             alive: log p(alive) of the nodes' states, [R].
         """
         expand(self.trees, rows, nodes, push, alive, self.limit)
+
+    def wander(self, rows: NDArray[np.int64], chance: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return a node that one push leads to from the first of R trees, by chance as its probabilities are, [R].
+
+        Args:
+            rows: Trees whose first node alone was expanded, [R].
+            chance: Uniform random numbers from [0, 1), [R].
+
+        Returns:
+            -1 where no push leads anywhere.
+        """
+        children = np.empty(len(rows), np.int64)
+        wander(self.trees, rows, chance, children)
+        return children
 
     def question(self, rows: NDArray[np.int64]) -> None:
         """Let R trees that are solved, [R], search on: does each push beside the way leave a solution too?
@@ -140,11 +153,10 @@ class Forest:
             way.append(node)
         return np.array(way[::-1], np.int64)
 
-    def boards(self, row: int, nodes: NDArray[np.int64]) -> BitBoards:
-        """Return the states of nodes of a tree, [X]."""
-        trees = self.trees
-        wall, target = np.full(len(nodes), trees.wall[row]), np.full(len(nodes), trees.target[row])
-        return BitBoards(wall, target, trees.box[row, nodes], trees.agent[row, nodes])
+    def boards(self, row: int | NDArray[np.int64], nodes: NDArray[np.int64]) -> BitBoards:
+        """Return the states of nodes, [X], of a tree or of a tree each, [X]."""
+        trees, rows = self.trees, np.broadcast_to(row, nodes.shape)
+        return BitBoards(trees.wall[rows], trees.target[rows], trees.box[rows, nodes], trees.agent[rows, nodes])
 
     def judge(self, row: int) -> Verdicts:
         """Return what the search in a tree proved."""

@@ -265,6 +265,25 @@ def expand(
 
 
 @njit(cache=True, nogil=True)
+def wander(
+    trees: Trees, rows: NDArray[np.int64], chance: NDArray[np.float64], children: NDArray[np.int64]
+) -> None:
+    """Choose a push out of the first node of each of R trees; see `forest.Forest.wander`."""
+    for i in range(len(rows)):
+        row = np.int64(rows[i])
+        total = 0.0
+        for child in range(1, trees.nodes[row]):
+            total += np.exp(trees.logp[row, child])
+        children[i] = -1
+        left = chance[i] * total
+        for child in range(1, trees.nodes[row]):
+            children[i] = child
+            left -= np.exp(trees.logp[row, child])
+            if left < 0.0:
+                break
+
+
+@njit(cache=True, nogil=True)
 def _cost(trees: Trees, row: Int, node: Int, base: Int) -> float:
     """Return the cost of a node in a search from node `base`, before the verdict on it counts."""
     depth, logp = trees.depth[row], trees.logp[row]

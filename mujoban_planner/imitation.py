@@ -29,7 +29,7 @@ from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import lineage, origin, provenance, save_weights
+from mujoban_rl.weights import lineage, origin, provenance, save_weights, usable_device
 
 _CLIP = 1.0
 """Largest norm of the gradient."""
@@ -136,7 +136,7 @@ class ImitationLearner(Learner[Batch]):
 
     def __init__(self, config: LearnerConfig, device: torch.device | str = "cpu") -> None:
         """Make the network."""
-        self.config, self.device = config, torch.device(device)
+        self.config, self.device = config, usable_device(device)
         torch.manual_seed(config.seed)  # the initial weights
         self.network = config.build().to(self.device)
         if config.init is not None:
@@ -208,7 +208,7 @@ def imitation(
         config: What to train; fixed for the run.
         directory: Run directory.
         cadence: How often it evaluates and saves.
-        device: Device of the network.
+        device: Device of the networks, of the learner and of those whose play is corrected.
         actors: Where lessons are made; in between by default.
         bags: Recorded bags, or folders of bags, whose decisions are labelled and join the batches.
 
@@ -218,14 +218,11 @@ def imitation(
     """
     run = RunDirectory(directory, config)
     learner = ImitationLearner(config, device)
-    source = _source(config, actors or ActorOptions(), bags)
-    training = asdict(config)
-    if math.isinf(config.horizon_seconds):
-        training["horizon_seconds"] = None
+    source = _source(config, actors or ActorOptions(), bags, device)
     record = {
         **provenance(),
         "method": "imitation",
-        "training": training,
+        "training": recorded(config),
         "data": lineage(_data(config, bags), config.init),
         "init": origin(config.init),
         "bags": [bag.name for bag in bags],
@@ -235,24 +232,30 @@ def imitation(
     return Trainer(run, learner, source, budget, cadence, record=record)
 
 
-def _source(config: ImitationConfig, actors: ActorOptions, bags: Sequence[Path]) -> Source[Batch]:
+def recorded(config: LearnerConfig) -> dict[str, Any]:
+    """Return a configuration as records of weights keep it; a horizon that never comes is none there."""
+    return {k: None if k == "horizon_seconds" and math.isinf(v) else v for k, v in asdict(config).items()}
+
+
+def _source(config: ImitationConfig, actors: ActorOptions, bags: Sequence[Path], device: str) -> Source[Batch]:
     """Return lessons, decisions from bags, or both."""
     if not bags:
-        return _lessons(config, actors)
-    recorded = round(config.bag_share * config.batch_size)
-    found = BagLessons(Lessons.read(bags, config.seed), max(recorded, 1), config.bag_estimates, config.seed)
-    if recorded >= config.batch_size:
+        return _lessons(config, actors, device)
+    shown = round(config.bag_share * config.batch_size)
+    found = BagLessons(Lessons.read(bags, config.seed), max(shown, 1), config.bag_estimates, config.seed)
+    if shown >= config.batch_size:
         return found
-    return LessonsAndBags(_lessons(replace(config, batch_size=config.batch_size - recorded), actors), found)
+    fewer = replace(config, batch_size=config.batch_size - shown)
+    return LessonsAndBags(_lessons(fewer, actors, device), found)
 
 
-def _lessons(config: ImitationConfig, actors: ActorOptions) -> LessonSource:
-    return LessonSource(config, actors.pool(partial(LessonActor, config, config.network)))
+def _lessons(config: ImitationConfig, actors: ActorOptions, device: str) -> LessonSource:
+    return LessonSource(config, actors.pool(partial(LessonActor, config, config.network, device=device)))
 
 
 def _data(config: ImitationConfig, bags: Sequence[Path]) -> str:
     lessons = "solver demonstrations and corrections of own play on generated levels, training seeds"
-    recorded = "decisions in bags, labelled by the solver"
+    labelled = "decisions in bags, labelled by the solver"
     if not bags:
         return lessons
-    return recorded if config.bag_share == 1.0 else f"{lessons}; {recorded}"
+    return labelled if config.bag_share == 1.0 else f"{lessons}; {labelled}"

@@ -65,15 +65,16 @@ class LessonActor(Actor):
     Delivered are the columns of `Samples` of one lesson, under `demonstrations.` or `corrections.`; a step is a sample.
     """
 
-    def __init__(self, config: LessonConfig, network: NetworkConfig, stream: int) -> None:
+    def __init__(self, config: LessonConfig, network: NetworkConfig, stream: int, *, device: str = "cpu") -> None:
         """Start without a lesson.
 
         Args:
             config: What defines the lessons.
             network: What to build for the weights whose play is corrected.
             stream: Of levels and randomness.
+            device: Of that network.
         """
-        self._config, self._planner = config, network.build().eval()
+        self._config, self._planner = config, network.build().eval().to(device)
         self._planner.lay_out()
         mix = difficulty_shares(config.mix)
         self._maker = LessonMaker(

@@ -205,13 +205,14 @@ def errs(planner: LearnedPlanner, samples: Samples) -> NDArray[np.bool_]:
     for start in range(0, n, _FORWARD):
         rows = np.arange(start, min(start + _FORWARD, n))
         batch = make_batch(samples.take(rows), np.zeros(len(rows), np.int64))
-        with autocast("cpu"):
+        batch = batch.to(planner.device)
+        with autocast(planner.device):
             output = planner(batch.state)
         wrong = batch.right.any(1) & ~batch.right.gather(1, output.policy.argmax(1, keepdim=True))[:, 0]
         wrong |= _misjudged(output.dead, batch.dead, batch.dead_known)
         if output.push_dead is not None:
             wrong |= _misjudged(output.push_dead, batch.push_dead, batch.push_known)
-        found[rows] = wrong.numpy()
+        found[rows] = wrong.cpu().numpy()
     return found
 
 

@@ -77,6 +77,11 @@ class LearnedPlanner(nn.Module, Planner):
         """`weigh` for a single robot as an exported graph, of the weights that were loaded."""
 
     @property
+    def device(self) -> torch.device:
+        """Where the network is."""
+        return next(self.parameters()).device
+
+    @property
     def config(self) -> dict[str, Any]:
         """Keyword arguments that rebuild the module."""
         return dict(self._config)
@@ -183,8 +188,7 @@ class LearnedPlanner(nn.Module, Planner):
         if self.compiled is not None and len(abstract_state) == self.thinking == 1:
             score, push, push_alive = self.compiled(inputs)
         else:
-            device = next(self.parameters()).device
-            weighed = self.weigh(*(torch.from_numpy(x).to(device) for x in inputs))
+            weighed = self.weigh(*(torch.from_numpy(x).to(self.device) for x in inputs))
             score, push, push_alive = (x.cpu().numpy() for x in weighed)
         means = PushMeans(means.boxes, means.views + self.views, push, push_alive)
         return score.astype(np.float64) - visit_penalty(counts), means

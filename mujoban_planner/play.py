@@ -66,7 +66,7 @@ def play(
     memory = planner.initial_state(np.zeros(batch, np.int64)).memory
     decisions = 0
     for t in range(limit):
-        with autocast("cpu", enabled=reduced_precision):
+        with autocast(getattr(planner, "device", "cpu"), enabled=reduced_precision):
             decision, after = planner.decide(abstract_states(levels), take_rows(memory, active))
         memory = put_rows(memory, active, after)
         decisions += len(active)

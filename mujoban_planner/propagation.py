@@ -50,7 +50,8 @@ def propagate(planes: Tensor) -> Tensor:
     ahead = shifted(floor)  # Shape [B, D, I, I]
     # A box needs room on both sides; what may be pushed north may be pushed south.
     upright, sideways = (torch.minimum(torch.minimum(ahead[:, d], ahead[:, _OPPOSITE[d]]), floor) for d in (0, 1))
-    decay = planes.new_tensor(_DECAY)[:, None, None, None]
+    # Filled rather than copied from a list, which nobody could do while a CUDA graph is captured.
+    decay = torch.stack([planes.new_full((1, 1, 1), share) for share in _DECAY])
     start = torch.stack([agent, agent, target])
     spread = _spread(start, torch.stack([free, free, upright]), torch.stack([free, free, sideways]), decay)
     return spread.transpose(0, 1)
@@ -65,7 +66,8 @@ def legal_pushes(planes: Tensor, reachable: Tensor) -> Tensor:
     """
     floor, box = planes[:, 0], planes[:, BOX]
     ahead = shifted(torch.minimum(floor, 1.0 - box))
-    behind = shifted(reachable)[:, _OPPOSITE]
+    behind = shifted(reachable)
+    behind = torch.stack([behind[:, d] for d in _OPPOSITE], 1)
     return torch.minimum(torch.minimum(ahead, behind), box[:, None])
 
 
@@ -88,7 +90,7 @@ def walk_to_push(push: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
     # A push in direction d starts in the cell whose neighbour in direction d holds the box.
     boxes = _neighbours(functional.pad(wanted, (1, 1, 1, 1)))
     start = torch.stack([boxes[d][:, d] for d in range(4)], 1)  # Shape [B, D, I, I]
-    value = _spread(torch.minimum(start.amax(1), free)[None], free[None], free[None], push.new_tensor(_WALK_DECAY))[0]
+    value = _spread(torch.minimum(start.amax(1), free)[None], free[None], free[None], push.new_full((), _WALK_DECAY))[0]
     nearness = value.clamp(min=1e-6).log() / -math.log(_WALK_DECAY)
     gain = (shifted(value).clamp(min=1e-6).log() / -math.log(_WALK_DECAY) - nearness[:, None]).clamp(-1.0, 1.0)
     here = agent[:, None]

@@ -11,24 +11,31 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from torch.nn import functional
 
-from mujoban_core.grid import Instruction
+from mujoban_core.grid import CHANNELS, GRID_SIZE, Instruction
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.forest import Forest
 from mujoban_planner.forest_kernels import region_of
 from mujoban_planner.heads import verdicts
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.shortening import shorten
+from mujoban_rl.precision import autocast
 from mujoban_sokoban.solver_labels import moves_of
 
 _FIRST: Final = np.zeros(1, np.int64)
+_WARM_UPS: Final = 3
+"""Evaluations before one is captured: libraries choose their kernels in the first."""
+Evaluation = Callable[[BitBoards], tuple[NDArray[np.float32], NDArray[np.float32]]]
+"""What `evaluate_boards` returns of M states."""
 
 
 class Found(NamedTuple):
@@ -52,29 +59,62 @@ def search(planner: LearnedPlanner, starts: BitBoards, *, expansions: int, limit
     n = len(starts.agent)
     forest = Forest(n, expansions, limit)
     forest.plant(np.arange(n), starts)
+    evaluate = partial(evaluate_boards, planner)
     for _ in range(expansions):
         rows = np.flatnonzero(forest.open)
         if not rows.size:
             break
-        grow(forest, rows, planner)
+        grow(forest, rows, evaluate)
     return Found([_instructions(forest, starts, row) for row in range(n)], forest.expansions.copy())
 
 
-def grow(forest: Forest, rows: NDArray[np.int64], planner: LearnedPlanner) -> None:
-    """Expand a node of each of the trees `rows`, which are open, by one evaluation of the planner."""
+def grow(forest: Forest, rows: NDArray[np.int64], evaluate: Evaluation) -> None:
+    """Expand a node of each of the trees `rows`, which are open, by one evaluation."""
     nodes, boards = forest.pop(rows)
-    push, alive = _evaluate(planner, boards)
+    push, alive = evaluate(boards)
     forest.expand(rows, nodes, push, alive)
 
 
-@torch.inference_mode()
-def _evaluate(planner: LearnedPlanner, boards: BitBoards) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def evaluate_boards(planner: LearnedPlanner, boards: BitBoards) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return how promising pushes are, as log-probabilities, [M, 4, I * I], and log p(alive), [M]."""
-    device = next(planner.parameters()).device
-    output, _ = planner.read(state_tensor(boards).to(device))
+    push, alive = _judge(planner, state_tensor(boards).to(planner.device))
+    return push.cpu().numpy(), alive.cpu().numpy()
+
+
+@torch.inference_mode()
+def _judge(planner: LearnedPlanner, states: Tensor) -> tuple[Tensor, Tensor]:
+    output, _ = planner.read(states)
     alive = functional.logsigmoid(-output.dead[:, Instruction.STAY])
     push = output.push + verdicts(output)
-    return push.flatten(2).float().cpu().numpy(), alive.float().cpu().numpy()
+    return push.flatten(2).float(), alive.float()
+
+
+class GraphedEvaluation:
+    """`evaluate_boards` of always as many states as a CUDA graph, of whatever weights the planner has by then.
+
+    A few hundred small kernels follow each other at once, where launching each would take longer than it runs; so
+    many processes can share a GPU.
+    """
+
+    def __init__(self, planner: LearnedPlanner, batch: int) -> None:
+        """Capture the evaluation of `batch` states by a planner on a GPU."""
+        self._states = torch.zeros(batch, GRID_SIZE, GRID_SIZE, len(CHANNELS), device=planner.device)
+        stream = torch.cuda.Stream(planner.device)
+        stream.wait_stream(torch.cuda.current_stream(planner.device))
+        with torch.cuda.stream(stream), autocast(planner.device):
+            for _ in range(_WARM_UPS):
+                _judge(planner, self._states)
+        torch.cuda.current_stream(planner.device).wait_stream(stream)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph), autocast(planner.device):
+            self._push, self._alive = _judge(planner, self._states)
+
+    @torch.inference_mode()
+    def __call__(self, boards: BitBoards) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return what `evaluate_boards` returns."""
+        self._states.copy_(state_tensor(boards))
+        self._graph.replay()
+        return self._push.cpu().numpy(), self._alive.cpu().numpy()
 
 
 class LoneSearch:
@@ -121,7 +161,7 @@ def advance(
             break
         popped = [forest.pop(_FIRST) for forest in active]
         columns = zip(*(boards for _, boards in popped), strict=True)
-        push, alive = _evaluate(planner, BitBoards._make(np.concatenate(column) for column in columns))
+        push, alive = evaluate_boards(planner, BitBoards._make(np.concatenate(column) for column in columns))
         for i, (forest, (nodes, _)) in enumerate(zip(active, popped, strict=True)):
             forest.expand(_FIRST, nodes, push[i : i + 1], alive[i : i + 1])
         total += len(active)

@@ -19,6 +19,7 @@ from typing import Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_core.grid import DIFFICULTIES
@@ -28,7 +29,7 @@ from mujoban_planner.boards import BitBoards, level_batch
 from mujoban_planner.forest import Forest, Verdicts
 from mujoban_planner.lessons import errs
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch, unlabelled
-from mujoban_planner.search import grow
+from mujoban_planner.search import GraphedEvaluation, evaluate_boards, grow
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import DEAD_SHARE, judge_instructions, label_dead, label_demonstrations, possible_pushes
 from mujoban_planner.training_levels import Ticket, TrainingLevels, stream_number
@@ -107,7 +108,9 @@ class SearchActor(Actor):
     off them, with what was proved there, under `verdict.`.
     """
 
-    def __init__(self, network: NetworkConfig, config: SearchConfig, seed: int, stream: int) -> None:
+    def __init__(
+        self, network: NetworkConfig, config: SearchConfig, seed: int, stream: int, *, device: str = "cpu"
+    ) -> None:
         """Start without a search.
 
         Args:
@@ -115,12 +118,13 @@ class SearchActor(Actor):
             config: What defines the searches.
             seed: Of the run.
             stream: Of levels and randomness; those of another seed are others.
+            device: Of the network.
 
         Raises:
             ValueError: If the stream has no training seeds.
         """
         number = stream_number(seed, stream)
-        self.planner, self.config = network.build().eval(), config
+        self.planner, self.config = network.build().eval().to(device), config
         self.planner.lay_out()
         self._levels = TrainingLevels(number, retried=config.retried, retries=config.retries)
         self._forest = Forest(config.trees, (config.expansions << config.retries) + config.questions, MOVE_LIMIT)
@@ -128,6 +132,7 @@ class SearchActor(Actor):
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
         self._leads = [_Lead(playing=False) for _ in range(config.trees)]
         self._rng = np.random.default_rng([number, 4])
+        self._graphed: GraphedEvaluation | None = None
 
     def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
         """Guide by newer weights."""
@@ -183,9 +188,7 @@ class SearchActor(Actor):
                 self._tickets[row], self._leads[row] = ticket, _Lead(playing=ticket.failures == 0)
                 self._budgets[row] = config.expansions << ticket.failures
         self._grow()
-        for row, lead in enumerate(self._leads):
-            if lead.playing:
-                self._play(row, lead, ended)
+        self._play(ended)
 
     def _prioritise(self, samples: Samples) -> Samples:
         """Return the samples on which the planner errs, and a share of the others."""
@@ -197,30 +200,51 @@ class SearchActor(Actor):
         """Expand a node of every tree; a search that finds its way goes on to judge the pushes beside it."""
         forest = self._forest
         searching = forest.trees.solution < 0
-        with autocast("cpu"):
-            grow(forest, np.arange(self.config.trees), self.planner)
+        grow(forest, np.arange(self.config.trees), self._evaluate)
         solved = np.flatnonzero(searching & (forest.trees.solution >= 0))
         forest.question(solved)
         self._budgets[solved] = forest.expansions[solved] + self.config.questions
 
-    def _play(self, row: int, lead: _Lead, ended: dict[str, list[bool]]) -> None:
-        """Push once by chance, as the planner's probabilities are, in a tree whose first node was just expanded."""
-        trees, ticket = self._forest.trees, self._tickets[row]
-        children = np.arange(1, trees.nodes[row])
-        lead.won = bool(trees.solution[row] >= 0)
-        if lead.won or not children.size or len(lead.states) == self.config.lead:
-            lead.playing = False
-            self._levels.rate(ticket, lead.won)
-            ended[f"play/{ticket.difficulty}"].append(lead.won)
-            if lead.won:
-                self._budgets[row] = 0
-            else:
-                self._go_back(row, lead)
-            return
-        chances = np.exp(trees.logp[row, children].astype(np.float64))
-        child = int(self._rng.choice(children, p=chances / chances.sum()))
-        lead.states.append((int(trees.box[row, 0]), int(trees.agent[row, 0]), int(trees.push[row, child])))
-        self._forest.plant(np.array([row]), self._forest.boards(row, np.array([child])))
+    def _evaluate(self, boards: BitBoards) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return what the planner says of a state of every tree."""
+        if self.planner.device.type == "cuda":
+            if self._graphed is None:
+                self._graphed = GraphedEvaluation(self.planner, self.config.trees)
+            return self._graphed(boards)
+        with autocast(self.planner.device):
+            return evaluate_boards(self.planner, boards)
+
+    def _play(self, ended: dict[str, list[bool]]) -> None:
+        """Push once by chance, as the planner's probabilities are, in every tree that is played.
+
+        Of each the first node was just expanded.
+        """
+        forest, trees = self._forest, self._forest.trees
+        rows = np.array([row for row, lead in enumerate(self._leads) if lead.playing], np.int64)
+        children = forest.wander(rows, self._rng.random(len(rows)))
+        won = trees.solution[rows] >= 0
+        full = np.array([len(self._leads[row].states) == self.config.lead for row in rows.tolist()], np.bool_)
+        over = won | full | (children < 0)
+        for row, solved in zip(rows[over].tolist(), won[over].tolist(), strict=True):
+            self._end_play(row, solved, ended)
+        rows, children = rows[~over], children[~over]
+        states = zip(
+            trees.box[rows, 0].tolist(), trees.agent[rows, 0].tolist(), trees.push[rows, children].tolist(), strict=True
+        )
+        for row, state in zip(rows.tolist(), states, strict=True):
+            self._leads[row].states.append(state)
+        forest.plant(rows, forest.boards(rows, children))
+
+    def _end_play(self, row: int, won: bool, ended: dict[str, list[bool]]) -> None:
+        """Take note of how a level was played; what is lost is searched."""
+        lead, ticket = self._leads[row], self._tickets[row]
+        lead.playing, lead.won = False, won
+        self._levels.rate(ticket, won)
+        ended[f"play/{ticket.difficulty}"].append(won)
+        if won:
+            self._budgets[row] = 0
+        else:
+            self._go_back(row, lead)
 
     def _go_back(self, row: int, lead: _Lead) -> None:
         """Begin the search of a level that own play has lost: at its start, or somewhere on the way that it took."""

@@ -123,11 +123,14 @@ class ExpertIteration(_ActorCommand):
 
     run: Path = Path("runs/planner_search")
     """Run directory; an existing one is resumed."""
+    device: str = "cpu"
+    """Device of the networks, of the learner and of those who search."""
     config: tyro.conf.OmitArgPrefixes[ExpertIterationConfig] = field(default_factory=ExpertIterationConfig)
 
     def main(self) -> None:
         """Train."""
-        expert_iteration(self.config, self.run, self.cadence(), self.actors).run(limit_seconds=self.seconds)
+        trainer = expert_iteration(self.config, self.run, self.cadence(), self.actors, device=self.device)
+        trainer.run(limit_seconds=self.seconds)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from mujoban_planner.forest import Forest
 from mujoban_planner.lessons import errs
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.samples import Samples, concatenate
-from mujoban_planner.search import grow
+from mujoban_planner.search import evaluate_boards, grow
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
 from mujoban_planner.teacher import reachable_pushes
 from mujoban_planner.training_levels import TrainingLevels
@@ -88,7 +89,7 @@ def test_of_the_lessons_those_are_kept_in_which_the_planner_errs():
     for easy in (0.0, 1.0):
         actor = SearchActor(NETWORK, replace(SMALL, trees=64, easy=easy), 0, 0)
         actor.planner = load(compiled=False)
-        lessons = [actor.act().arrays for _ in range(5)]
+        lessons = [actor.act().arrays for _ in range(12)]
         samples = concatenate(
             [Samples._make(x[f"{kind}.{name}"] for name in Samples._fields) for x in lessons for kind in KINDS]
         )
@@ -103,7 +104,7 @@ def test_a_solved_search_goes_on_to_judge_the_pushes_beside_its_way():
     forest.plant(np.arange(32), bit_boards(generate_batch(3, range(TRAIN_SEEDS.start, TRAIN_SEEDS.start + 32))))
     planner = ResidualPlanner(8, 1, judge=True).eval()
     while (rows := np.flatnonzero(forest.open & (forest.expansions < 200))).size:
-        grow(forest, rows, planner)
+        grow(forest, rows, partial(evaluate_boards, planner))
     solved = np.flatnonzero(forest.trees.solution > 0)
     assert len(solved) > 8
 
@@ -116,7 +117,7 @@ def test_a_solved_search_goes_on_to_judge_the_pushes_beside_its_way():
     forest.question(solved)
     for _ in range(150):
         if (rows := solved[forest.trees.waiting[solved] > 0]).size:
-            grow(forest, rows, planner)
+            grow(forest, rows, partial(evaluate_boards, planner))
     after = [judged(row) for row in solved]
     assert all((x & ~y == 0).all() for x, y in zip(before, after, strict=True)), "nothing is forgotten"
     assert [forest.way(row).tolist() for row in solved] == ways, "the solution stays what it was"
@@ -149,7 +150,7 @@ def test_a_search_that_has_looked_everywhere_proves_a_level_lost():
     while forest.open.any():
         verdicts = forest.judge(0)
         assert 0 not in verdicts.node[verdicts.lost], "not while a state waits"
-        grow(forest, np.arange(1), planner)
+        grow(forest, np.arange(1), partial(evaluate_boards, planner))
         steps += 1
     verdicts = forest.judge(0)
     assert verdicts.lost[0] and not verdicts.solvable[0]
