@@ -283,7 +283,8 @@ def _lay_out(optimiser: torch.optim.Optimizer) -> None:
     """Lay moments out in memory as the parameters are, which may be channels-last: fused optimisers rely on it."""
     for parameter, moments in optimiser.state.items():
         for key, value in moments.items():
-            if isinstance(value, Tensor) and value.shape == parameter.shape:
+            # Steps are counted on the CPU or where the parameter is, as the optimiser has it.
+            if key != "step" and isinstance(value, Tensor) and value.shape == parameter.shape:
                 moments[key] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
 
 
