@@ -196,13 +196,14 @@ class BagTicks(Iterator[Fields]):
         tick = {name: np.stack([fields[name][t] for fields, t in found]) for name in found[0][0]}
         fresh = self._policy.initial_memory(len(found))
         memory = Recurrent(*renew_rows(self._memory, fresh, tick["first"]))
-        seen = (torch.from_numpy(tick[name])[:, None] for name in INPUT_FIELDS)
+        seen = (torch.from_numpy(tick[name]).to(self._policy.device)[:, None] for name in INPUT_FIELDS)
         output = self._policy(*seen, memory=memory)
         self._memory = output.memory
         if self._teacher is None:
             # The policy that learns did not play these ticks, but it is the one whose values are asked for.
-            tick |= {"mean": output.action.mean[:, 0].numpy(), "scale": output.action.scale[:, 0].numpy()}
-        return tick | {name: m.numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
+            mean, scale = (x[:, 0].cpu().numpy() for x in output.action)
+            tick |= {"mean": mean, "scale": scale}
+        return tick | {name: m.cpu().numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
 
     def state(self) -> State:
         """Return where each row is, with the policy's memory."""
@@ -212,7 +213,8 @@ class BagTicks(Iterator[Fields]):
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         self._episodes.restore(state.part("episodes"))
-        self._memory = Recurrent(*(state.part("memory").tensors[name] for name in MEMORY_FIELDS))
+        tensors = state.part("memory").tensors
+        self._memory = Recurrent(*(tensors[name].to(self._policy.device) for name in MEMORY_FIELDS))
 
 
 def _check_about(bag: Bag, config: GoalTaskConfig) -> None:

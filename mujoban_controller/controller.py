@@ -215,7 +215,9 @@ class VisuomotorController(GoalPolicy, Controller):
     def side_ahead(self, memory: Memory) -> Tensor:
         """Return the side that each robot puts ahead, in quarter turns to the left, int64 [B]."""
         track = Recurrent(*memory).track
-        return torch.zeros(len(track), dtype=torch.int64) if self.compass is None else track[:, _SIDE].long()
+        if self.compass is None:
+            return torch.zeros(len(track), dtype=torch.int64, device=track.device)
+        return track[:, _SIDE].long()
 
     def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
         """Return the encoding of all inputs but the frame, [M, F].
@@ -312,7 +314,7 @@ class VisuomotorController(GoalPolicy, Controller):
 
     def initial_memory(self, batch: int) -> Memory:
         """Return zeros, a `Recurrent`."""
-        device = self.mean.weight.device
+        device = self.device
         track = _TRACK if self.compass is None else _SIDE + 1
         return Recurrent(*(torch.zeros(batch, n, device=device) for n in (self.hidden, self.hidden, track)))
 
@@ -324,7 +326,7 @@ class VisuomotorController(GoalPolicy, Controller):
 
     def to_tensors(self, inputs: ControllerInput) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return one tick's observations, [B, ...], as sequences of one tick, [B, 1, ...], on the module's device."""
-        device = self.mean.weight.device
+        device = self.device
         arrays = (
             np.ascontiguousarray(inputs.frame),
             np.asarray(inputs.proprio, np.float32),

@@ -22,7 +22,7 @@ from mujoban_controller.controller import INPUT_FIELDS, ControllerOutput, Visuom
 from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask
-from mujoban_controller.play import Batch, CameraPlayer, Fields
+from mujoban_controller.play import Batch, CameraPlayer, Fields, put_on
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
@@ -142,7 +142,7 @@ def imitation_loss(
 def jitter_colours(frame: Tensor, amount: float, generator: torch.Generator) -> Tensor:
     """Return frames [M, W, H, W, 3] with each colour of each window brighter or darker, as floats up to 255."""
     gain = 1.0 + amount * (2.0 * torch.rand(len(frame), 1, 1, 1, 3, generator=generator) - 1.0)
-    return (frame * gain).clamp_(max=255.0)
+    return (frame * gain.to(frame.device)).clamp_(max=255.0)
 
 
 class DistilPlayer(CameraPlayer):
@@ -161,7 +161,7 @@ class DistilPlayer(CameraPlayer):
 
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
         config, task, generator = self._config, self.task, self.generator
-        task.put_ahead(self.policy.side_ahead(self._memory).numpy())
+        task.put_ahead(self.policy.side_ahead(self._memory).cpu().numpy())
         label = self._teacher(task)
         if self._frames % (config.window * len(mean)) == 0:
             share = max(1.0 - self._frames / max(config.warm_up, 1), config.guided)
@@ -201,10 +201,10 @@ class DistilLearner(ProductLearner[Batch]):
         generator: torch.Generator,
         validation: Validation | None = None,
     ) -> None:
-        """Train `student` in place; `generator` draws the jitter of colours."""
+        """Train `student` in place, where it is; `generator`, on the CPU, draws the jitter of colours."""
         super().__init__(validation or Validation())
         self.student, self.config, self._generator = student, config, generator
-        self.head = GoalHead(student.hidden + student.config["features"])
+        self.head = GoalHead(student.hidden + student.config["features"]).to(student.device)
         self._average = moving_average(student, config.average, warm_up=True)
         parameters = [*student.parameters(), *self.head.parameters()]
         self._adam = torch.optim.Adam(parameters, config.learning_rate, fused=True)
@@ -239,7 +239,7 @@ class DistilLearner(ProductLearner[Batch]):
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one gradient step."""
-        student, config = self.student, self.config
+        student, config, batch = self.student, self.config, put_on(batch, self.student.device)
         for policy in (student, self.product):
             policy.normalise(batch)
         frame = jitter_colours(batch["frame"], config.jitter, self._generator)
@@ -251,4 +251,5 @@ class DistilLearner(ProductLearner[Batch]):
             self._average.update_parameters(student)
             stats["gradient_norm"] = norm
         self._schedule.follow(progress)
-        return {k: float(v) for k, v in stats.items()}
+        # All at once: to wait for a GPU takes longer than to copy a number.
+        return dict(zip(stats, torch.stack(list(stats.values())).tolist(), strict=True))

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_controller.goal_features import feature_layout
-from mujoban_controller.play import CRITIC, Batch, CriticDraw
+from mujoban_controller.play import CRITIC, Batch, CriticDraw, put_on
 from mujoban_controller.policy import GoalPolicy
 from mujoban_controller.privileged import Critic
 from mujoban_controller.product import ProductLearner, Validation
@@ -153,24 +153,24 @@ class MPOLearner(ProductLearner[Batch]):
         validation: Validation | None = None,
         critic: Critic | None = None,
     ) -> None:
-        """Train `policy` in place.
+        """Train `policy` in place, where it is.
 
         Args:
             policy: What is to be improved.
             body: Of the robot.
             config: Settings.
-            generator: Draws the actions of the E-step.
+            generator: Draws the actions of the E-step, on the CPU.
             validation: On what the policy is judged.
             critic: Its critic, if it is not to begin untaught, or sees more than the privileged features of the goal
                 task.
         """
         super().__init__(validation or Validation())
         self.policy, self.config, self._generator = policy, config, generator
-        self.critic = critic or Critic(body)
-        self.loss = MPOLoss(policy.action_size, config.loss)
+        self.critic = (critic or Critic(body)).to(policy.device)
+        self.loss = MPOLoss(policy.action_size, config.loss).to(policy.device)
         self.target_policy, self.target_critic = deepcopy(policy), deepcopy(self.critic)
         self._average = moving_average(policy, config.average) if config.average else None
-        self._actuators = torch.from_numpy(feature_layout(get_body(body)).actuators)
+        self._actuators = torch.from_numpy(feature_layout(get_body(body)).actuators).to(policy.device)
         self._policy_adam = torch.optim.Adam(policy.parameters(), config.policy_rate, fused=True)
         self._critic_adam = torch.optim.Adam(self.critic.parameters(), config.critic_rate, fused=True)
         self._dual_adam = self.loss.duals.adam(config.loss.dual_learning_rate)
@@ -211,7 +211,8 @@ class MPOLearner(ProductLearner[Batch]):
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one step of the critic, and one of the policy unless the batch was refused."""
-        config, beside = self.config, _beside(batch)
+        config, batch = self.config, put_on(batch, self.policy.device)
+        beside = _beside(batch)
         # A number that is not finite in one of two batches refuses both.
         if beside and not guard.accept(*batch.values(), part="batch"):
             return {}

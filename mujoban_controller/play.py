@@ -26,6 +26,11 @@ Fields = dict[str, NDArray]
 Batch = dict[str, Tensor]
 
 
+def put_on(batch: Batch, device: torch.device) -> Batch:
+    """Return a batch on a device. Replays are in the machine's memory; frames travel as bytes."""
+    return {name: values.to(device) for name, values in batch.items()}
+
+
 def _outcome(step: TaskStep) -> Fields:
     return {"reward": step.reward, "discount": step.discount, "truncated": step.truncated}
 
@@ -111,9 +116,9 @@ class CameraPlayer(TaskPlayer):
     """A camera policy with its memory; what it makes of its distribution over torques is up to subclasses."""
 
     def __init__(self, task: GoalTask, policy: VisuomotorController, generator: torch.Generator) -> None:
-        """Play with a copy of `policy` and randomness from `generator`."""
+        """Play with a copy of `policy`, where it is, and randomness from `generator`, which is on the CPU."""
         self.task, self.generator = task, generator
-        self._policy = VisuomotorController(**policy.config)
+        self._policy = VisuomotorController(**policy.config).to(policy.device)
         self._policy.mixed_precision = policy.mixed_precision
         self._memory: Memory = self._policy.initial_memory(task.world.batch)
 
@@ -131,15 +136,15 @@ class CameraPlayer(TaskPlayer):
         output = self._policy(*self._policy.to_tensors(inputs), memory=Recurrent(*memory))
         self._memory = output.memory
         kept: Fields = {name: getattr(inputs, name) for name in INPUT_FIELDS}
-        kept |= {name: m.numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
-        torque, extra = self._act(inputs, output.action.mean[:, 0], output.action.scale[:, 0])
+        kept |= {name: m.cpu().numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
+        torque, extra = self._act(inputs, *(x[:, 0].cpu() for x in output.action))
         result = task.step(torque)
         kept |= {"first": first, **extra, **_outcome(result)}
         return kept, result.outcomes
 
     @abstractmethod
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
-        """Return the torques to apply, [B, U], and what else is to be kept of the tick."""
+        """Return the torques to apply, [B, U], and what else is to be kept of the tick; `mean` is on the CPU."""
 
     def take(self, weights: Mapping[str, Tensor]) -> None:
         """Act with these weights from now on."""
@@ -156,7 +161,7 @@ class CameraPlayer(TaskPlayer):
         super().restore(state)
         tensors = state.part("policy").tensors
         self.generator.set_state(tensors["generator"])
-        self._memory = Recurrent(*(tensors[name] for name in MEMORY_FIELDS))
+        self._memory = Recurrent(*(tensors[name].to(self._policy.device) for name in MEMORY_FIELDS))
 
 
 class ExploringPlayer(CameraPlayer):

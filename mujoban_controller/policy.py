@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
 from mujoban_controller.drivers import Driver
@@ -26,6 +27,11 @@ class GoalPolicy(nn.Module, ABC):
     """Arguments that build it."""
     action_size: int
     """U."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return next(self.parameters()).device
 
     @abstractmethod
     def over_windows(self, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:

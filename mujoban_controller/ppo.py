@@ -93,7 +93,8 @@ def log_prob(policy: Gaussian, action: Tensor) -> Tensor:
 
 def mirrored(x: Tensor, mirror: Rearrangement) -> Tensor:
     """Return what the mirrored robot would see or do, [..., N]."""
-    return x[..., torch.from_numpy(mirror.source)] * torch.from_numpy(mirror.sign)
+    source, sign = (torch.from_numpy(a).to(x.device) for a in mirror)
+    return x[..., source] * sign
 
 
 class RolloutSource(Source[Rollout]):
@@ -153,10 +154,10 @@ class PPOLearner(ProductLearner[Rollout]):
         generator: torch.Generator,
         validation: Validation | None = None,
     ) -> None:
-        """Train `policy` in place; `generator` fixes the order of samples."""
+        """Train `policy` in place, where it is; `generator`, on the CPU, fixes the order of samples."""
         super().__init__(validation or Validation())
         self.policy, self.config = policy, config
-        self.value = Value(body)
+        self.value = Value(body).to(policy.device)
         layout = feature_layout(get_body(body))
         self._mirror, self._mirror_action = layout.mirror, layout.mirror_action
         self._turning = layout.holds if get_body(body).turn is None else None
@@ -195,10 +196,11 @@ class PPOLearner(ProductLearner[Rollout]):
 
     def update(self, batch: Rollout, progress: float, guard: NaNGuard) -> Scalars:
         """Learn from a rollout for some epochs; adapt the learning rate to how much that changed the policy."""
-        config, samples = self.config, self._samples(batch)
+        config, batch = self.config, Rollout(*(x.to(self.policy.device) for x in batch))
+        samples = self._samples(batch)
         count, last, stats = len(samples[0]), [], {}
         for epoch in range(config.epochs):
-            order = torch.randperm(count, generator=self._generator)
+            order = torch.randperm(count, generator=self._generator).to(self.policy.device)
             for chosen in order.split(config.minibatch):
                 loss, stats = self._loss(*(x[chosen] for x in samples))
                 if guarded_step(loss, [self._adam], guard, clip=config.clip) is not None and epoch == config.epochs - 1:

@@ -46,7 +46,7 @@ from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.networks import set_scale
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import WeightsError, load_weights, origin, provenance
+from mujoban_rl.weights import WeightsError, load_weights, origin, provenance, usable_device
 from mujoban_sim.oracles import OraclePlanner
 
 PROG = "mujoban_controller.train"
@@ -127,9 +127,13 @@ class Options:
     save_every: float = 300.0
     """Seconds between checkpoints."""
     threads: int = 1
+    """For physics and pictures, and for networks on the CPU."""
+    device: str = "cpu"
+    """Device of the networks: cpu or cuda, such as cuda:0."""
 
     def __post_init__(self) -> None:
-        """Reject bags that nothing would learn from."""
+        """Reject a device that is not there and bags that nothing would learn from."""
+        usable_device(self.device)
         if self.bags and self.config.stage == "teacher":
             raise ValueError("--bags: a teacher does not learn from them; expected --stage distil or mpo")
         if not 0.0 < self.bag_share <= 1.0:
@@ -142,6 +146,7 @@ class _Parts:
     def __init__(self, options: Options) -> None:
         self.options, self.config = options, options.config
         config = self.config
+        self.device = usable_device(options.device)
         torch.manual_seed(config.seed)
         self._streams = iter(np.random.SeedSequence(config.seed).spawn(8))
         rng = np.random.default_rng(next(self._streams))
@@ -221,7 +226,7 @@ class _Parts:
         return self._replay(player, settings, self._recorded(policy, rows, teacher), rows)
 
     def _recorded(self, policy: VisuomotorController, rows: int, teacher: PrivilegedPolicy | None) -> BagPlayer:
-        own = VisuomotorController(**policy.config)
+        own = VisuomotorController(**policy.config).to(policy.device)
         own.load_state_dict(policy.state_dict())
         own.mixed_precision = policy.mixed_precision
         rng = np.random.default_rng(next(self._streams))
@@ -244,8 +249,8 @@ class _Parts:
     def _privileged(self, scale: float) -> PrivilegedPolicy:
         config = self.config
         if config.initial is not None:
-            return load_weights(PrivilegedPolicy, config.initial, body=config.task.body).train()
-        return PrivilegedPolicy(config.task.body, scale=scale)
+            return load_weights(PrivilegedPolicy, config.initial, self.device, body=config.task.body).train()
+        return PrivilegedPolicy(config.task.body, scale=scale).to(self.device)
 
     def _camera(self) -> VisuomotorController:
         config, n = self.config, self.config.network
@@ -254,7 +259,7 @@ class _Parts:
         else:
             policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden)
         policy.mixed_precision = True
-        return policy.train()
+        return policy.to(self.device).train()
 
 
 def _data(options: Options) -> str:
@@ -299,7 +304,8 @@ def make_trainer(options: Options) -> Trainer[Any]:
 def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
     """Run the command."""
     options = read_options(Options, command_line, prog, __doc__)
-    set_threads(options.threads)
+    # Beside a GPU only physics and pictures have work for several, and those have threads of their own.
+    set_threads(options.threads if usable_device(options.device).type == "cpu" else 1)
     make_trainer(options).run(limit_seconds=options.seconds)
     return 0
 

@@ -74,8 +74,11 @@ def check_samples(samples: int) -> None:
 
 
 def paired_noise(samples: int, like: Tensor, generator: torch.Generator) -> Tensor:
-    """Return N = `samples` draws of noise, each with its opposite, [N, ...]: where values are alike the mean stays."""
-    half = torch.randn((samples // 2, *like.shape), generator=generator)
+    """Return N = `samples` draws of noise, each with its opposite, [N, ...]: where values are alike the mean stays.
+
+    The generator may be on the CPU wherever `like` is, so that a run draws the same on every device.
+    """
+    half = torch.randn((samples // 2, *like.shape), generator=generator, device=generator.device).to(like.device)
     return torch.cat([half, -half])
 
 

@@ -21,7 +21,7 @@ from mujoban_controller.instructions import InstructionConfig, TerminationConfig
 from mujoban_controller.mpo import AsymmetricConfig, MPOTrainingConfig
 from mujoban_controller.ppo import PPOTrainingConfig
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
-from mujoban_controller.train import NetworkConfig, Options, TrainConfig, make_trainer
+from mujoban_controller.train import NetworkConfig, Options, TrainConfig, main, make_trainer
 from mujoban_core.grid import Instruction
 from mujoban_rl.engine import Trainer
 from mujoban_rl.limits import NaNGuard
@@ -100,6 +100,22 @@ def test_a_batch_with_nan_leaves_all_that_a_stage_learns_untouched(make, tmp_pat
 
 def test_a_run_that_is_terminated_and_resumed_equals_one_that_never_stopped(make, tmp_path):
     check_resuming(make, tmp_path, stop_at=3, updates=6)
+
+
+def test_a_device_that_is_not_there_is_named_before_anything_is_made(tmp_path):
+    with pytest.raises(ValueError, match=r"device 'cuda:99': torch can use \d+ CUDA devices here, expected cpu"):
+        main(["--run", str(tmp_path / "run"), "--device", "cuda:99"])
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_a_run_on_a_gpu_goes_on_on_the_cpu_and_back(make, tmp_path):
+    for updates, device in enumerate(("cuda", "cpu", "cuda"), 1):
+        trainer = make(tmp_path, device=device)
+        trainer.run(limit_updates=2 * updates)
+        assert trainer.progress.updates == 2 * updates
+        weights = (p for module in trainer.learner.modules.values() for p in module.parameters())
+        assert {p.device.type for p in weights} == {device}
 
 
 def test_the_product_of_a_run_has_a_record_and_loads(make, tmp_path):
