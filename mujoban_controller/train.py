@@ -75,6 +75,8 @@ class TrainConfig:
     """Environment steps of all robots together."""
     cpu_seconds: float = 1e9
     """CPU seconds of training at which the run is complete, if its steps have not come first."""
+    horizon_seconds: float = 1e9
+    """Wall-clock seconds of training likewise: the measure where a GPU computes."""
     seed: int = 0
     initial: Path | None = None
     """Weights to start from."""
@@ -99,7 +101,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         """Reject settings that contradict each other."""
         check_counts(self, "steps")
-        check_positive(self, "cpu_seconds")
+        check_positive(self, "cpu_seconds", "horizon_seconds")
         if self.teacher is not None and self.stage != "distil":
             raise ValueError(f"--teacher {self.teacher}: only the stage distil has a teacher, not {self.stage}")
         if self.teacher is None and self.stage == "distil":
@@ -297,7 +299,7 @@ def make_trainer(options: Options) -> Trainer[Any]:
         # What such a run makes is what has solved most, and that may be what it begins with.
         evaluate_first=config.stage == "mpo" and config.initial is not None,
     )  # fmt: skip
-    budget = Budget(samples=config.steps, cpu_seconds=config.cpu_seconds)
+    budget = Budget(samples=config.steps, cpu_seconds=config.cpu_seconds, seconds=config.horizon_seconds)
     return Trainer(directory, learner, source, budget, cadence, record=record)
 
 

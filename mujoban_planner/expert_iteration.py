@@ -5,14 +5,13 @@ Searches run in actors (`search_lessons`); who learns from them is the learner o
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
-from mujoban_planner.imitation import ImitationLearner, LearnerConfig, recorded
+from mujoban_planner.imitation import ImitationLearner, LearnerConfig
 from mujoban_planner.samples import Batch
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
 from mujoban_rl.actors import ActorOptions, ActorSource
@@ -44,7 +43,7 @@ class ExpertIterationConfig(LearnerConfig):
     cpu_seconds: float = 10_800.0
     """CPU seconds after which the run is complete; the learning rate falls until then. Two cores have so many in 90
     minutes."""
-    horizon_seconds: float = math.inf
+    horizon_seconds: float = 1e9
     """Wall-clock seconds after which it is complete, whichever comes first: the measure where a GPU computes."""
     updates: float = 1e9
     """Updates after which it is complete."""
@@ -53,9 +52,7 @@ class ExpertIterationConfig(LearnerConfig):
         """Reject numbers with which nothing is learned, and what is no share."""
         super().__post_init__()
         check_counts(self, "channels", "blocks", "first_evaluations")
-        check_positive(self, "evaluations", "learning_rate")
-        if not self.horizon_seconds > 0.0:
-            raise ValueError(f"--horizon-seconds {self.horizon_seconds}: expected a positive number")
+        check_positive(self, "evaluations", "learning_rate", "horizon_seconds")
         check_shares(self, "warm_up")
 
 
@@ -85,7 +82,7 @@ def expert_iteration(
     record = {
         **provenance(),
         "method": "expert-iteration",
-        "training": recorded(config),
+        "training": asdict(config),
         "init": origin(config.init),
         "data": lineage(_DATA, config.init),
     }

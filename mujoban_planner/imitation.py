@@ -219,10 +219,13 @@ def imitation(
     run = RunDirectory(directory, config)
     learner = ImitationLearner(config, device)
     source = _source(config, actors or ActorOptions(), bags, device)
+    training = asdict(config)
+    if math.isinf(config.horizon_seconds):
+        training["horizon_seconds"] = None
     record = {
         **provenance(),
         "method": "imitation",
-        "training": recorded(config),
+        "training": training,
         "data": lineage(_data(config, bags), config.init),
         "init": origin(config.init),
         "bags": [bag.name for bag in bags],
@@ -230,11 +233,6 @@ def imitation(
     }
     budget = Budget(samples=config.horizon_samples, seconds=config.horizon_seconds)
     return Trainer(run, learner, source, budget, cadence, record=record)
-
-
-def recorded(config: LearnerConfig) -> dict[str, Any]:
-    """Return a configuration as records of weights keep it; a horizon that never comes is none there."""
-    return {k: None if k == "horizon_seconds" and math.isinf(v) else v for k, v in asdict(config).items()}
 
 
 def _source(config: ImitationConfig, actors: ActorOptions, bags: Sequence[Path], device: str) -> Source[Batch]:
