@@ -1,24 +1,28 @@
-"""Batches from recorded bags, read in a process beside the training or between its steps."""
+"""Batches from recorded bags, read in processes beside the training or between its steps."""
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from mujoban_core import children
 from mujoban_core.bodies import get_body
-from mujoban_estimator.bag_stream import BagStream, KeptBags
-from mujoban_estimator.data import Batch, Batcher
+from mujoban_core.worker import Worker
+from mujoban_estimator.bag_stream import TOPICS, BagStream, KeptBags, stretches
+from mujoban_estimator.data import Batch, Batcher, Stretch
+from mujoban_msgs_py.bags.training import ReadReport, open_training_bag
 from mujoban_rl.engine import Source, State
 
+_T = TypeVar("_T")
 _AHEAD: Final = 2
 """Batches that are read ahead."""
 
@@ -58,13 +62,13 @@ class _Item(NamedTuple):
 class _Batches(IterableDataset[_Item]):
     """Endless batches from a place on."""
 
-    def __init__(self, reading: Reading, place: _Place | None) -> None:
+    def __init__(self, reading: Reading, place: _Place | None, kept: KeptBags | None = None) -> None:
         super().__init__()
-        self._reading, self._place = reading, place
+        self._reading, self._place, self._kept = reading, place, kept
 
     def __iter__(self) -> Iterator[_Item]:
         r = self._reading
-        kept = KeptBags()
+        kept = KeptBags() if self._kept is None else self._kept
         streams = [
             BagStream(r.bags, r.length, rng, kept, skip_damaged=r.skip_damaged, allow_test_seeds=r.allow_test_seeds)
             for rng in np.random.default_rng([r.seed, 0]).spawn(r.streams)
@@ -79,21 +83,48 @@ class _Batches(IterableDataset[_Item]):
             yield _Item(batch, place, time.process_time())
 
 
+class _Bag(NamedTuple):
+    """What a reading process hands over of a bag."""
+
+    stretches: list[Stretch]
+    cpu_seconds: float
+
+
+class _Bags(Dataset[_Bag]):
+    """All bags, one after the other."""
+
+    def __init__(self, reading: Reading) -> None:
+        super().__init__()
+        self._reading = reading
+
+    def __len__(self) -> int:
+        return len(self._reading.bags)
+
+    def __getitem__(self, index: int) -> _Bag:
+        r, start = self._reading, time.process_time()
+        bag = open_training_bag(r.bags[index], TOPICS, skip_damaged=r.skip_damaged)
+        gathered = list(stretches(bag, r.length, ReadReport(), allow_test_seeds=r.allow_test_seeds))
+        return _Bag(gathered, time.process_time() - start)
+
+
 class BagSource(Source[Batch]):
     """Endless batches from bags, each of which continues the one before; samples are ticks."""
 
     def __init__(self, reading: Reading, workers: int = 1) -> None:
         """Read in a process beside (`workers` = 1) or between the steps (0); what is read is the same.
 
+        Several processes read all bags, as far as they can be kept, when `read_all` is called or the first batch asked
+        for; a thread then joins them.
+
         Raises:
-            ValueError: If there is to be another number of processes: the memory of a stream goes on from batch to
-                batch, so that they come from one reader.
+            ValueError: If the number of processes is negative.
         """
-        if workers not in (0, 1):
-            raise ValueError(f"workers is {workers}: expected 1, a process beside, or 0, none")
+        if workers < 0:
+            raise ValueError(f"workers is {workers}: expected a number of processes, from 0")
         self._reading, self._workers = reading, workers
         self._place: _Place | None = None
         self._items: Iterator[_Item] | None = None
+        self._kept: KeptBags | None = None
         self._cpu_seconds = 0.0
 
     def next_batch(self) -> Batch:
@@ -103,24 +134,35 @@ class BagSource(Source[Batch]):
             BagError: If a bag is not what is expected (see `BagStream`).
         """
         if self._items is None:
-            with children.sheltered():
-                self._items = iter(self._loader())
+            self.read_all()
+            self._items = self._open()
         item = next(self._items)
         self._place = item.after
-        self._cpu_seconds = item.cpu_seconds if self._workers else 0.0
+        if self._workers == 1:
+            self._cpu_seconds = item.cpu_seconds
         self.samples += item.batch.valid.size
         return item.batch
 
-    def _loader(self) -> DataLoader[_Item]:
-        return DataLoader(
-            _Batches(self._reading, self._place),
-            batch_size=None,
-            num_workers=self._workers,
-            prefetch_factor=_AHEAD if self._workers else None,
-            collate_fn=_as_is,  # pyright: ignore[reportArgumentType] - one batch at a time, not a list
-            worker_init_fn=_begin,
-            generator=torch.Generator(),  # else the loader draws from the global one
-        )
+    def read_all(self) -> None:
+        """Read all bags where that is for several processes, which have not done it: before a clock runs, say.
+
+        Raises:
+            BagError: If a bag is not what is expected (see `BagStream`).
+        """
+        if self._workers < 2 or self._kept is not None:
+            return
+        self._kept = KeptBags()
+        with children.sheltered():
+            for path, bag in zip(self._reading.bags, _loader(_Bags(self._reading), self._workers), strict=True):
+                self._kept.keep(path, bag.stretches)
+                self._cpu_seconds += bag.cpu_seconds
+
+    def _open(self) -> Iterator[_Item]:
+        batches = _Batches(self._reading, self._place, self._kept)
+        if self._kept is not None:
+            return _ahead(iter(batches))
+        with children.sheltered():
+            return iter(_loader(batches, self._workers))
 
     def state(self) -> State:
         """Return the place in the bags, which are named, so that others begin anew."""
@@ -135,7 +177,7 @@ class BagSource(Source[Batch]):
             self._place = _Place(state.values["streams"], state.tensors["seen"].numpy())
 
     def worker_cpu_seconds(self) -> float:
-        """Return the CPU time of the reading process."""
+        """Return the CPU time of the reading processes."""
         return self._cpu_seconds
 
     def close(self) -> None:
@@ -143,7 +185,33 @@ class BagSource(Source[Batch]):
         self._items = None
 
 
-def _as_is(item: _Item) -> _Item:
+def _loader(dataset: Dataset[_T], workers: int) -> DataLoader[_T]:
+    return DataLoader(
+        dataset,
+        batch_size=None,
+        num_workers=workers,
+        prefetch_factor=_AHEAD if workers else None,
+        collate_fn=_as_is,
+        worker_init_fn=_begin,
+        generator=torch.Generator(),  # else the loader draws from the global one
+    )
+
+
+def _ahead(items: Iterator[_Item]) -> Iterator[_Item]:
+    """Yield items that a thread makes ahead."""
+    thread = Worker("batches")
+    try:
+        waiting = deque(thread.submit(next, items) for _ in range(_AHEAD))
+        while True:
+            item = waiting.popleft().result()
+            waiting.append(thread.submit(next, items))
+            yield item
+    finally:
+        thread.drop()
+        thread.end()
+
+
+def _as_is(item: Any) -> Any:
     return item
 
 

@@ -89,6 +89,11 @@ class KeptBags:
         """Return the stretches of a bag that is kept."""
         return self._bags.get(path)
 
+    def keep(self, path: Path, gathered: list[Stretch]) -> None:
+        """Keep all stretches of a bag if there is room."""
+        for _ in self.keeping(path, iter(gathered)):
+            pass
+
     def keeping(self, path: Path, reader: Iterator[Stretch]) -> Iterator[Stretch]:
         """Yield what a reader of a bag yields, and keep it from its end on if there is room."""
         gathered, size, fits = [], 0, True

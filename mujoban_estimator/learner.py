@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,9 +83,11 @@ class TrainConfig:
     """Most steps of the run."""
     cpu_seconds: float = 1e9
     """CPU seconds of training at which the run is complete, if its steps have not come first."""
+    horizon_seconds: float = 1e9
+    """Likewise of wall-clock seconds, for a GPU; evaluations are left out."""
     learning_rate: float = 1.5e-3
     warm_up: float = 0.0025
-    """Share of the budget, of steps or CPU seconds, within which the learning rate rises from 0."""
+    """Share of the budget, of steps or seconds, within which the learning rate rises from 0."""
     final_rate: float = 0.03
     """Learning rate at the end of the budget, as a share of `learning_rate`; it falls linearly."""
     clip: float = 1.0
@@ -97,7 +100,7 @@ class TrainConfig:
         if self.length < 1 or self.length % every:
             raise ValueError(f"length is {self.length}: expected a multiple of update_every, {every}")
         check_counts(self, "streams", "steps")
-        check_positive(self, "cpu_seconds", "learning_rate", "clip")
+        check_positive(self, "cpu_seconds", "horizon_seconds", "learning_rate", "clip")
         if not 1 <= self.shards <= self.streams:
             raise ValueError(f"{self.shards} shards of {self.streams} streams: expected 1 to {self.streams}")
         check_shares(self, "warm_up", "final_rate")
@@ -188,7 +191,7 @@ class EstimatorLearner(Learner[Batch]):
         learned = self._learn(batch)
         loss = torch.stack([one.loss for one in learned]).mean()
         for parameter, *gradients in zip(self._parameters, *(one.gradients for one in learned), strict=True):
-            parameter.grad = _mean([g for g in gradients if g is not None], len(learned))
+            parameter.grad = _mean(parameter, [g for g in gradients if g is not None], len(learned))
         if step_if_finite(loss, [self.optimiser], guard, clip=self.training.clip) is not None:
             # What a refused batch left in memory would spoil those to come.
             self._belief = Belief(*(torch.cat(rows) for rows in zip(*(one.belief for one in learned), strict=True)))
@@ -240,7 +243,9 @@ class EstimatorLearner(Learner[Batch]):
         belief = renew_rows(self._belief, self.estimator.initial_belief(streams), batch.first)
         track = renew_rows(self._track, self._lost_track(streams), batch.first)
         frames = -(-self.config.window_frames // count)
-        for rows in np.array_split(np.arange(streams), count):
+        # Slices, whose frames are not copied.
+        bounds = np.cumsum([0, *map(len, np.array_split(np.arange(streams), count))]).tolist()
+        for rows in (slice(*both) for both in pairwise(bounds)):
             part = Batch._make(values[rows] for values in batch)
             windows = choose_windows(part, frames, self.config.window_length, self.rng)
             yield _Shard(part, windows, Belief(*(b[rows] for b in belief)), Track(*(t[rows] for t in track)))
@@ -301,6 +306,14 @@ class EstimatorLearner(Learner[Batch]):
         return torch.from_numpy(values).to(self.device)
 
 
-def _mean(gradients: Sequence[Tensor], count: int) -> Tensor | None:
-    """Return the mean over `count` shards; those that a parameter has no part in count as zeros."""
-    return torch.stack(list(gradients)).sum(dim=0) / count if gradients else None
+def _mean(parameter: Tensor, gradients: Sequence[Tensor], count: int) -> Tensor | None:
+    """Return a parameter's mean gradient over `count` shards; those that it has no part in count as zeros.
+
+    It lies in memory as the parameter does: Adam's one kernel takes it as it lies, or refuses it on a GPU.
+    """
+    if not gradients:
+        return None
+    total = torch.empty_like(parameter).copy_(gradients[0])
+    for gradient in gradients[1:]:
+        total += gradient
+    return total / count

@@ -79,12 +79,8 @@ class Odometry:
         velocity = torch.stack([ahead * cos - left * sin, ahead * sin + left * cos], dim=-1)  # [B, T, 2]
         offsets = torch.as_tensor(OFFSETS_XY, dtype=proprio.dtype, device=proprio.device)
         direction = offsets[instruction]
-        rows = []
-        for t in range(proprio.shape[1]):
-            track = _advance(track, velocity[:, t], direction[:, t], terminated[:, t])._replace(heading=psi[:, t])
-            rows.append(track)
-        tracks = Track(*(torch.stack(parts, dim=1) for parts in zip(*rows, strict=True)))
-        return self._features(proprio, velocity, direction, tracks), track
+        tracks = _follow(track, velocity, direction, terminated, psi)
+        return self._features(proprio, velocity, direction, tracks), Track(*(part[:, -1] for part in tracks))
 
     def _headings(self, proprio: Tensor, track: Track) -> Tensor:
         """Return the heading of each tick, [B, T]."""
@@ -127,12 +123,29 @@ def turn(vector: Tensor, direction: Tensor) -> Tensor:
     return torch.stack(turned, dim=-1)
 
 
-def _advance(track: Track, velocity: Tensor, direction: Tensor, terminated: Tensor) -> Track:
-    """Return the track one tick later; all arguments are of one tick, [B, ...]."""
-    issued = terminated[:, None]
-    start = torch.where(issued, track.position, track.start)
-    before = torch.where(issued, track.direction, track.before)
-    origin = torch.where(issued, torch.round(track.position - _BEHIND * before), track.origin)
-    position = track.position + 0.5 * CONTROL_PERIOD * (track.velocity + velocity)
-    elapsed = torch.where(terminated, torch.zeros_like(track.elapsed), track.elapsed) + 1
-    return Track(position, velocity, start, origin, elapsed, direction, before, track.heading)
+def _follow(track: Track, velocity: Tensor, direction: Tensor, terminated: Tensor, heading: Tensor) -> Track:
+    """Return the tracks after each tick, [B, T, ...], of a track before the first; all ticks at once."""
+    ticks = torch.arange(1, terminated.shape[1] + 1, device=terminated.device)
+    # When the instruction in force was issued: 0 before the first tick.
+    issued = torch.where(terminated, ticks, torch.zeros_like(ticks)).cummax(dim=1).values
+    steps = 0.5 * CONTROL_PERIOD * (_behind(track.velocity, velocity) + velocity)
+    positions = torch.cat([track.position[:, None], steps], dim=1).cumsum(dim=1)
+    before = _behind(track.direction, direction)
+    origins = torch.round(positions[:, :-1] - _BEHIND * before)
+    kept = (track.elapsed[:, None] + ticks).to(track.elapsed.dtype)
+    elapsed = torch.where(issued > 0, (ticks - issued + 1).to(kept.dtype), kept)
+    return Track(
+        positions[:, 1:], velocity, _since(issued, track.start, positions[:, :-1]),
+        _since(issued, track.origin, origins), elapsed, direction, _since(issued, track.before, before), heading,
+    )  # fmt: skip
+
+
+def _behind(first: Tensor, values: Tensor) -> Tensor:
+    """Return the values of the tick before each, [B, T, 2]."""
+    return torch.cat([first[:, None], values[:, :-1]], dim=1)
+
+
+def _since(issued: Tensor, before: Tensor, values: Tensor) -> Tensor:
+    """Return what was true when the instruction in force was issued, [B, T, 2]: `before`, or one of the values."""
+    all_values = torch.cat([before[:, None], values], dim=1)
+    return all_values.gather(1, issued[..., None].expand(*issued.shape, values.shape[-1]))

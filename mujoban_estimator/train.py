@@ -53,7 +53,7 @@ class Options:
     """Stop, with a checkpoint, after this time."""
     threads: int = 1
     workers: int = 1
-    """Processes that read bags: 1, or 0 to read between the steps."""
+    """Processes that read bags: 1 beside the steps, 0 to read between them, several to read all bags before them."""
     evaluate_every: int = 1000
     """Steps between evaluations."""
     save_every: float = 120.0
@@ -97,14 +97,18 @@ def make_trainer(options: Options) -> Trainer[Batch]:
         "world": ", ".join(sorted(worlds)),
         "training": asdict(config),
     }
-    return Trainer(
+    source = BagSource(reading, options.workers)
+    trainer = Trainer(
         RunDirectory(options.run, config),
         learner,
-        BagSource(reading, options.workers),
-        Budget(updates=config.steps, cpu_seconds=config.cpu_seconds),
+        source,
+        Budget(updates=config.steps, cpu_seconds=config.cpu_seconds, seconds=config.horizon_seconds),
         Cadence(log_updates=50, evaluate_samples=every, save_seconds=options.save_every),
         record=record,
     )
+    if not trainer.complete:
+        source.read_all()
+    return trainer
 
 
 def _digests(folder: Path) -> dict[str, str]:

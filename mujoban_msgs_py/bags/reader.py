@@ -15,7 +15,7 @@ from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.integrity import check_family, file_digest, read_identity, require_regular
 from mujoban_msgs_py.bags.metadata import FILE_NAME, FileRecord, Metadata
 from mujoban_msgs_py.bags.storage import Damage, McapFile, RawMessage, SqliteBag, Storage, TopicInfo
-from mujoban_msgs_py.bags.types import TypeRegistry, known_types
+from mujoban_msgs_py.bags.types import TypeRegistry, known_types, types_of_schemas
 from mujoban_msgs_py.decoders import DECODERS
 from mujoban_msgs_py.synchroniser import Synchroniser
 from mujoban_msgs_py.topics import Topic
@@ -154,7 +154,7 @@ class Bag:
         """The bag's message types, as they were when it was recorded."""
         schemas = {name: text for storage in self._storages for name, text in storage.schemas.items()}
         if all(info.type_name in schemas for info in self.topics.values()):
-            return TypeRegistry.of_schemas(schemas)
+            return types_of_schemas(tuple(schemas.items()))
         return known_types()
 
     def _deserialise(self, message: BagMessage) -> Any:
