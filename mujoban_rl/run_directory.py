@@ -56,7 +56,8 @@ class RunDirectory:
 
         Args:
             path: Directory; an existing one is resumed.
-            config: Dataclass or mapping; what must not change between the bits of a run.
+            config: Dataclass or mapping; what must not change between the bits of a run. Options that have come since
+                it began have to be at their defaults.
             keep: Number of checkpoints kept.
 
         Raises:
@@ -64,12 +65,12 @@ class RunDirectory:
         """
         self.path = Path(path)
         self.keep = keep
-        fields = dataclasses.asdict(config) if dataclasses.is_dataclass(config) else dict(config)  # type: ignore[arg-type]
-        self.config: dict[str, Any] = json.loads(json.dumps(fields, default=str))
+        self.config = _as_json(config)
         self.path.mkdir(parents=True, exist_ok=True)
         file = self.path / _CONFIG
         if file.exists() and any(other != file for other in self.path.iterdir()):
-            stored = _read_config(file)
+            # An option that there was not yet when the run began is as if it had been left alone.
+            stored = _overlaid(_defaults(config), _read_config(file))
             changed = sorted(k for k in stored.keys() | self.config.keys() if stored.get(k) != self.config.get(k))
             if changed:
                 pairs = ", ".join(f"{k}: {stored.get(k)!r} there, {self.config.get(k)!r} now" for k in changed)
@@ -231,6 +232,35 @@ def _newest_intact(directory: Path) -> tuple[Path, dict[str, Any], dict[str, Ten
 
 def _newest_first(directory: Path) -> list[Path]:
     return sorted(directory.glob("checkpoint-*.safetensors"), reverse=True)
+
+
+def _as_json(config: Any) -> dict[str, Any]:
+    """Return a configuration, a dataclass or a mapping, as the file has it."""
+    fields = dataclasses.asdict(config) if dataclasses.is_dataclass(config) else dict(config)  # type: ignore[arg-type]
+    return json.loads(json.dumps(fields, default=str))
+
+
+def _defaults(config: Any) -> dict[str, Any]:
+    """Return the options of a configuration that have defaults, with these, as the file would have them."""
+    if not dataclasses.is_dataclass(config):
+        return {}
+    found: dict[str, Any] = {}
+    for option in dataclasses.fields(config):
+        if option.default is not dataclasses.MISSING:
+            found[option.name] = option.default
+        elif option.default_factory is not dataclasses.MISSING:
+            made = option.default_factory()
+            found[option.name] = dataclasses.asdict(made) if dataclasses.is_dataclass(made) else made  # type: ignore[arg-type]
+    return _as_json(found)
+
+
+def _overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Return what two nested mappings hold; where both hold a value, that of the second."""
+    merged = below | above
+    for key in below.keys() & above.keys():
+        if isinstance(below[key], dict) and isinstance(above[key], dict):
+            merged[key] = _overlaid(below[key], above[key])
+    return merged
 
 
 def _read_config(file: Path) -> dict[str, Any]:

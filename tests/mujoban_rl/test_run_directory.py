@@ -4,6 +4,7 @@ import math
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass, field
 
 import pytest
 import torch
@@ -47,6 +48,29 @@ def test_resumed_training_equals_uninterrupted_training(tmp_path):
     _fit(net, adam, 3)
     _fit(again, adam2, 3)
     assert torch.equal(net.layer.weight, again.layer.weight)
+
+
+@dataclass(frozen=True)
+class _Part:
+    rate: float = 0.5
+    depth: int = 2
+
+
+@dataclass(frozen=True)
+class _Config:
+    steps: int
+    part: _Part = field(default_factory=_Part)
+    horizon: float = 9.0
+
+
+def test_a_run_from_before_an_option_came_goes_on_while_that_is_at_its_default(tmp_path):
+    RunDirectory(tmp_path, {"steps": 3, "part": {"rate": 0.1}})
+    (tmp_path / "metrics.jsonl").touch()
+    RunDirectory(tmp_path, _Config(3, _Part(rate=0.1)))
+    same = _Part(0.1)
+    for other in (_Config(3, same, horizon=8.0), _Config(3, _Part(0.1, depth=3)), _Config(3), _Config(4, same)):
+        with pytest.raises(RunError, match="another configuration"):
+            RunDirectory(tmp_path, other)
 
 
 @pytest.mark.parametrize("part", ["safetensors", "json"])
