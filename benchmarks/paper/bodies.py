@@ -21,7 +21,7 @@ _PAPER: Final = {BALL.name: 0.818, ANT.name: 0.737}
 """Success at difficulty 5 (paper A.3)."""
 _WEIGHTS: Final = ROOT / "mujoban_controller" / "weights"
 _CONTROLLERS: Final = {
-    BALL.name: _WEIGHTS / "reference" / "controller_ball.safetensors",
+    BALL.name: _WEIGHTS / "controller_ball.safetensors",
     ANT.name: _WEIGHTS / "teacher_ant.safetensors",
 }
 """Both learned in the reference world, in which they are compared."""

@@ -40,7 +40,7 @@ def generate_launch_description() -> LaunchDescription:
             "ticks of a turn on the spot, 0 for none, -1 for the body's own",
         ),
         "body": ("ball", "the robot's body"),
-        "world": ("eased", "the physical world"),
+        "world": ("reference", "the physical world"),
         "weights": ("", "folder of weights files, ROLE.safetensors, for the learned modules; empty: those that ship"),
         "look_ahead": ("0", "evaluations of a search ahead by the planner"),
         "difficulty": ("5", "of the levels"),
