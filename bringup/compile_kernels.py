@@ -46,7 +46,7 @@ def main() -> int:
     """Play and record a little, and make and read the planner's lessons and search for some."""
     _learn_from(LessonActor(LessonConfig(levels=4), _NETWORK, 0).act(), "demonstrations")
     SearchActor(_NETWORK, SearchConfig(trees=8, expansions=8, steps=40), 0, 0).act()
-    evaluate(Stack().policy(), Episodes(2, VALIDATION_SEEDS.start), time_limit=60)
+    evaluate(Stack().policy(), Episodes(2, VALIDATION_SEEDS.start), time_limit=80)
     with tempfile.TemporaryDirectory() as folder:
         _record(Path(folder))
     return 0

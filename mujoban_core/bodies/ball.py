@@ -50,5 +50,5 @@ BALL: Final = Body(
     camera=_CAMERA,
     mjcf=_MJCF,
     turn=(0.0, 0.7),
-    look_ticks=40,
+    look_ticks=58,
 )

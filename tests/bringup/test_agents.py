@@ -99,8 +99,8 @@ class Eastward(Agent):
 
     def step(self, inputs: AgentInput, state):
         yaw = inputs.pose[:, 2]
-        steer = -0.6 * np.sin(yaw / 2)
-        roll = np.where((np.cos(yaw) > 0.97), 0.5, 0.0)
+        steer = np.clip(-2.0 * np.sin(yaw / 2), -1.0, 1.0)
+        roll = np.where((np.cos(yaw) > 0.97), 0.8, 0.0)
         return np.stack([roll, steer], -1).astype(np.float32), state
 
 

@@ -193,7 +193,7 @@ def test_a_missing_topic_is_named_in_one_line(recorded, tmp_path, capsys):
     assert "lacks /torque" in said and said.count("\n") == 1
 
 
-@pytest.mark.parametrize(("option", "value"), [("world", "reference"), ("body", "ant")])
+@pytest.mark.parametrize(("option", "value"), [("world", "eased"), ("body", "ant")])
 def test_bags_of_another_world_or_body_are_refused(recorded, tmp_path, option, value):
     config = replace(MPO, task=replace(MPO.task, **{option: value}))
     with pytest.raises(BagError, match=rf"recorded with the {option} .*, expected {value} \(--task\.{option}\)"):

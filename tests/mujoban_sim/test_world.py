@@ -199,7 +199,7 @@ def test_a_level_with_one_box_is_solved_by_that_box_alone():
     x, y = cell_to_xy(level.player)
     world.place([0], [[x, y, 0.0]], world.box_position)
     for _ in range(100):
-        world.step(np.array([[0.6, 0.0]], np.float32))
+        world.step(np.array([[0.8, 0.0]], np.float32))
     assert world.solved[0] and world.episode_return[0] == 11.0
 
 
@@ -212,7 +212,7 @@ def test_completion_follows_the_instruction_in_force():
     for t in range(80):
         left = cell_to_xy((3, 5))[0] - world.box_position[0, 0, 0]
         speed = np.clip(3 * left, 0.0, 1.0)
-        roll = np.clip(0.5 * speed + 0.5 * (speed - world.proprio[0, 0]), -1.0, 1.0)
+        roll = np.clip(speed + 0.5 * (speed - world.proprio[0, 0]), -1.0, 1.0)
         world.instruct(np.array([Instruction.EAST]), np.array([False]))
         world.step(np.array([[roll, 0.0]], np.float32))
         if world.completed[0]:
