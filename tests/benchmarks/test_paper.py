@@ -105,7 +105,8 @@ def test_an_evaluation_goes_on_where_it_was_ended_and_gives_what_one_run_gives(f
     whole = runs.load(EASY)
     assert [episode["seed"] - runs.SEED for episode in whole["episodes"]] == [0, 1, 2] and whole["success_rate"] == 1.0
     game = whole["played"]
-    assert (game["difficulty"], game["seed"], game["look_ahead"]) == (1, runs.SEED, 0) and game["world"] == whole["world"]
+    assert (game["difficulty"], game["seed"], game["look_ahead"]) == (1, runs.SEED, 0)
+    assert game["world"] == whole["world"]
     assert [use["played"] for use in whole["test_uses"]] == [game]
     assert "easy: 3 of 3 levels, solved 3 (100.0 %)" in capfd.readouterr().out
     EASY.file.unlink()
