@@ -197,9 +197,11 @@ def test_only_the_learned_planner_thinks_longer(planner):
 
 
 def test_thinking_time_reaches_the_network():
-    network = load(compiled=False)
-    Deliberation(thinking=3).prepare(network)
-    assert network.thinking == network.views == 3
+    network, state = load(compiled=False), torch.from_numpy(abstract_states(generate_batch(5, range(2))))
+    with torch.inference_mode():
+        quick = network(state).push
+        Deliberation(thinking=3).prepare(network)
+        assert network.thinking == 3 and not torch.equal(network(state).push, quick)
 
 
 @pytest.mark.parametrize("name", ["thinking", "look_ahead", "per_tick", "certainty", "deadline"])
