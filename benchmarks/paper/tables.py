@@ -15,7 +15,7 @@ STALE = " †"
 """Marks a result of other weights than those that ship now."""
 MISSING = "-"
 MODULAR_LEVELS = (
-    "all difficulties; a solver's demonstrations, a teacher, rules that look around ([model cards](../models/))"
+    "all difficulties; its own search, a teacher, rules that look around ([model cards](../models/))"
 )
 """What the modules that ship learned from, where the other rows have reward alone."""
 
