@@ -34,12 +34,15 @@ class Part:
         return PARTS / self.run.name / f"{SEED + self.first}_{self.episodes}.json"
 
     def load(self) -> dict[str, Any] | None:
-        """Return the part's report, or None if it has not been measured with the weights that ship now."""
+        """Return the part's report, or None if it has not been measured as a whole with the weights that ship now.
+
+        An evaluation that is interrupted reports what it has.
+        """
         try:
             content = json.loads(self.file.read_text())
         except (OSError, json.JSONDecodeError):
             return None
-        return None if is_stale(content, self.run) else content
+        return None if len(content["episodes"]) != self.episodes or is_stale(content, self.run) else content
 
     def start(self) -> subprocess.Popen[bytes]:
         """Measure it in a process of its own."""

@@ -126,6 +126,15 @@ def test_an_evaluation_goes_on_where_it_was_ended_and_gives_what_one_run_gives(f
     assert joined["test_uses"][-1]["played"] is None
 
 
+def test_a_part_that_was_interrupted_is_measured_anew(folder):
+    part = parts.Part(EASY, 0, 2)
+    part.file.parent.mkdir(parents=True)
+    for played, whole in ((2, True), (1, False)):
+        write(EASY, 1, played, {"planner": "oracle"})
+        part.file.write_text(EASY.file.read_text())
+        assert (part.load() is not None) == whole
+
+
 def test_a_long_curve_is_thinned_to_means_that_weigh_instructions_alike(tmp_path):
     lines = [
         {"step": step, "instruction/move": float(step % 2), "instruction/move_n": 1 + 2 * (step % 2)}
