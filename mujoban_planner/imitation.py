@@ -239,11 +239,11 @@ def _source(config: ImitationConfig, actors: ActorOptions, bags: Sequence[Path],
     """Return lessons, decisions from bags, or both."""
     if not bags:
         return _lessons(config, actors, device)
-    shown = round(config.bag_share * config.batch_size)
-    found = BagLessons(Lessons.read(bags, config.seed), max(shown, 1), config.bag_estimates, config.seed)
-    if shown >= config.batch_size:
+    recorded = round(config.bag_share * config.batch_size)
+    found = BagLessons(Lessons.read(bags, config.seed), max(recorded, 1), config.bag_estimates, config.seed)
+    if recorded >= config.batch_size:
         return found
-    fewer = replace(config, batch_size=config.batch_size - shown)
+    fewer = replace(config, batch_size=config.batch_size - recorded)
     return LessonsAndBags(_lessons(fewer, actors, device), found)
 
 
@@ -253,7 +253,7 @@ def _lessons(config: ImitationConfig, actors: ActorOptions, device: str) -> Less
 
 def _data(config: ImitationConfig, bags: Sequence[Path]) -> str:
     lessons = "solver demonstrations and corrections of own play on generated levels, training seeds"
-    labelled = "decisions in bags, labelled by the solver"
+    recorded = "decisions in bags, labelled by the solver"
     if not bags:
         return lessons
-    return labelled if config.bag_share == 1.0 else f"{lessons}; {labelled}"
+    return recorded if config.bag_share == 1.0 else f"{lessons}; {recorded}"
