@@ -5,7 +5,6 @@ Shapes: B batch, N = `grid.GRID_SIZE`, I = N - 2, A = 5 instructions.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -71,7 +70,7 @@ class LearnerConfig(NetworkConfig):
 class ImitationConfig(LessonConfig, LearnerConfig):
     """What defines an imitation run."""
 
-    horizon_seconds: float = math.inf
+    horizon_seconds: float = 1e9
     """Training time at which the cosine schedule ends, whichever of the two horizons comes first."""
     horizon_samples: float = 4e6
     """Samples at which the cosine schedule ends."""
@@ -219,13 +218,10 @@ def imitation(
     run = RunDirectory(directory, config)
     learner = ImitationLearner(config, device)
     source = _source(config, actors or ActorOptions(), bags, device)
-    training = asdict(config)
-    if math.isinf(config.horizon_seconds):
-        training["horizon_seconds"] = None
     record = {
         **provenance(),
         "method": "imitation",
-        "training": training,
+        "training": asdict(config),
         "data": lineage(_data(config, bags), config.init),
         "init": origin(config.init),
         "bags": [bag.name for bag in bags],

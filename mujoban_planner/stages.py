@@ -48,7 +48,7 @@ def _imitation(settings: _Settings, place: _Place) -> Trainer[Any]:
     common = settings._asdict()
     # Its budget is wall-clock: lessons are made in a process beside.
     horizon = common.pop("cpu_seconds") / 2.0
-    config = ImitationConfig(**common, horizon_seconds=horizon, horizon_samples=math.inf)
+    config = ImitationConfig(**common, horizon_seconds=horizon, horizon_samples=1e12)
     return imitation(config, place.run, place.cadence, actors=ActorOptions("processes"))
 
 

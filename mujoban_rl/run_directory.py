@@ -236,8 +236,12 @@ def _newest_first(directory: Path) -> list[Path]:
 
 def _as_json(config: Any) -> dict[str, Any]:
     """Return a configuration, a dataclass or a mapping, as the file has it."""
-    fields = dataclasses.asdict(config) if dataclasses.is_dataclass(config) else dict(config)  # type: ignore[arg-type]
-    return json.loads(json.dumps(fields, default=str))
+    return json.loads(json.dumps(config if dataclasses.is_dataclass(config) else dict(config), default=_plain))
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON has for a value that it does not know: an object of settings, or text."""
+    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else str(value)  # type: ignore[arg-type]
 
 
 def _defaults(config: Any) -> dict[str, Any]:
@@ -249,8 +253,7 @@ def _defaults(config: Any) -> dict[str, Any]:
         if option.default is not dataclasses.MISSING:
             found[option.name] = option.default
         elif option.default_factory is not dataclasses.MISSING:
-            made = option.default_factory()
-            found[option.name] = dataclasses.asdict(made) if dataclasses.is_dataclass(made) else made  # type: ignore[arg-type]
+            found[option.name] = option.default_factory()
     return _as_json(found)
 
 
