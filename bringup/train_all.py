@@ -89,6 +89,11 @@ _SENSES_EVALUATIONS: Final = 500
 """Updates between two evaluations of the senses, per hour of the whole run."""
 _JUDGED_PER_HOUR: Final = 16
 """Validation levels of each such evaluation, per hour of the whole run; at most 64."""
+_STUDENT: Final = (
+    "--task.retry", "0.25", "--task.instructions.stay", "0.1", "--distil.infeasible-weight", "0.25",
+)  # fmt: skip
+"""The student sees more of instructions that failed before, and of STAYs, which the stack asks for often; what it is to
+do under pushes that are not possible weighs less, so that it tries those where it can't tell."""
 _SENSES: Final = ("--learner.slip", "0.015", "--learner.lost", "0.05")
 """How far the odometer is off in training of estimator and termination."""
 _STREAMS_ALONE: Final = 5
@@ -202,7 +207,7 @@ def _controller(options: Options) -> list[Stage]:
         ),
         _trainer(
             options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common,
-            *_from_before(options, "--initial", "controller")), student, "teacher",
+            *_STUDENT, *_from_before(options, "--initial", "controller")), student, "teacher",
             sources=_sources(options, "controller"),
         ),
         _trainer(
