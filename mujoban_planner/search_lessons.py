@@ -60,6 +60,8 @@ class SearchConfig:
     """How often a level that was not solved comes again."""
     retried: float = 0.15
     """Share of such levels."""
+    mined: float = 0.0
+    """Share of levels that own play lost when they first came; they come until it has won each several times."""
     steps: int = 8
     """Steps of every search that are delivered at once."""
     walks: float = 0.25
@@ -86,7 +88,7 @@ class SearchConfig:
         """Reject what is no number of its kind, and no share."""
         check_counts(self, "trees", "expansions", "steps", "buffer", "batch_size")
         check_counts(self, "questions", "retries", "lead", "verdicts", least=0)
-        check_shares(self, "retried", "walks", "led", "judged", "easy", "noise", "hidden")
+        check_shares(self, "retried", "mined", "walks", "led", "judged", "easy", "noise", "hidden")
 
 
 @dataclass
@@ -126,7 +128,7 @@ class SearchActor(Actor):
         number = stream_number(seed, stream)
         self.planner, self.config = network.build().eval().to(device), config
         self.planner.lay_out()
-        self._levels = TrainingLevels(number, retried=config.retried, retries=config.retries)
+        self._levels = TrainingLevels(number, retried=config.retried, retries=config.retries, mined=config.mined)
         self._forest = Forest(config.trees, (config.expansions << config.retries) + config.questions, MOVE_LIMIT)
         self._budgets = np.zeros(config.trees, np.int64)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
@@ -142,6 +144,7 @@ class SearchActor(Actor):
         """Let every search take so many steps."""
         lessons: dict[str, list[Samples]] = {"way": [unlabelled(_NO_BOARDS)], "verdict": [unlabelled(_NO_BOARDS)]}
         ended: dict[str, list[bool]] = {f"{kind}/{d}": [] for kind in ("play", "search") for d in DIFFICULTIES}
+        ended["play/mined"] = []
         for _ in range(self.config.steps):
             self._advance(lessons, ended)
         kept = {kind: self._prioritise(concatenate(parts)) for kind, parts in lessons.items()}
@@ -240,7 +243,7 @@ class SearchActor(Actor):
         lead, ticket = self._leads[row], self._tickets[row]
         lead.playing, lead.won = False, won
         self._levels.rate(ticket, won)
-        ended[f"play/{ticket.difficulty}"].append(won)
+        ended["play/mined" if ticket.mined else f"play/{ticket.difficulty}"].append(won)
         if won:
             self._budgets[row] = 0
         else:

@@ -30,6 +30,8 @@ _MASTERED: Final = 0.6
 _LATE_SHARE: Final = 0.9
 """Share of the hardest difficulty then; the one below it has the rest."""
 _KEPT_FAILURES: Final = 20_000
+_LEAVES: Final = 0.1
+"""Chance that a level which was lost at first is not drawn any more once it is won."""
 _STREAMS: Final = TRAIN_SEEDS.start + 700_000 * _SEEDS_PER_STREAM
 LAST_SEED: Final = (TRAIN_SEEDS.stop - _STREAMS) // (_STREAMS_PER_SEED * _SEEDS_PER_STREAM) - 1
 """The largest seed of a run whose every stream has levels."""
@@ -53,22 +55,27 @@ class Ticket(NamedTuple):
     seed: int
     failures: int
     """How often it was tried in vain before."""
+    mined: bool = False
+    """Whether it comes again because it was lost at first."""
 
 
 class TrainingLevels:
     """A stream of levels whose mix follows the solve rates that are reported.
 
     A difficulty weighs as much as its outcome is uncertain, r (1 - r) for a solve rate r. Levels that were not solved
-    come again.
+    come again, and so do those that were lost at the first try: a good planner meets few levels that are hard for it
+    otherwise. Boxoban's medium levels were chosen likewise, by what a planner lost (Guez et al. 2019).
     """
 
-    def __init__(self, stream: int, *, retried: float = 0.0, retries: int = 0) -> None:
+    def __init__(self, stream: int, *, retried: float = 0.0, retries: int = 0, mined: float = 0.0) -> None:
         """Draw from the training seeds and randomness of a stream.
 
         Args:
             stream: 0, 1, ...; different streams share no level.
             retried: Share of levels that were tried in vain before, while there are some.
             retries: How often a level comes again.
+            mined: Share of levels that were lost at the first try, while there are some; each is drawn until it has
+                been won several times.
 
         Raises:
             ValueError: If the stream has no training seeds.
@@ -77,9 +84,10 @@ class TrainingLevels:
         if stream < 0 or self._next + _SEEDS_PER_STREAM - 1 not in TRAIN_SEEDS:
             raise ValueError(f"stream {stream}: expected a number whose seeds lie in {TRAIN_SEEDS}, as of a small seed")
         self._rng = np.random.default_rng([stream, 3])
-        self._retried, self._retries = retried, retries
+        self._retried, self._retries, self._mined = retried, retries, mined
         self._solved, self._tried = np.zeros((2, len(DIFFICULTIES)))
         self._failed: list[Ticket] = []
+        self._lost: list[Ticket] = []
 
     @property
     def success_rates(self) -> NDArray[np.float64]:
@@ -106,14 +114,22 @@ class TrainingLevels:
         tickets = []
         for difficulty in difficulties:
             if self._failed and self._rng.random() < self._retried:
-                tickets.append(self._failed.pop(int(self._rng.integers(len(self._failed)))))
+                tickets.append(self._pop(self._failed))
+            elif self._mined and self._lost and self._rng.random() < self._mined:
+                tickets.append(self._pop(self._lost))
             else:
                 tickets.append(Ticket(difficulty, self._next, 0))
                 self._next += 1
         return _boards(tickets), tickets
 
     def rate(self, ticket: Ticket, solved: bool) -> None:
-        """Take note of how a level ended at the first try."""
+        """Take note of how a level ended at the first try, or of one that is mined at another."""
+        if self._mined and not (solved and (not ticket.mined or self._rng.random() < _LEAVES)):
+            self._lost.append(ticket._replace(mined=True))
+            if len(self._lost) > _KEPT_FAILURES:
+                self._pop(self._lost)
+        if ticket.mined:
+            return
         i = list(DIFFICULTIES).index(ticket.difficulty)
         self._solved[i] = _MEMORY * self._solved[i] + solved
         self._tried[i] = _MEMORY * self._tried[i] + 1.0
@@ -126,16 +142,21 @@ class TrainingLevels:
     def state(self) -> State:
         """Return all that changes."""
         rates = {"solved": self._solved.tolist(), "tried": self._tried.tolist()}
-        failed = [list(ticket) for ticket in self._failed]
-        return State({"next": self._next, "rng": self._rng.bit_generator.state, "failed": failed, **rates})
+        waiting = {"failed": [list(x) for x in self._failed], "lost": [list(x) for x in self._lost]}
+        return State({"next": self._next, "rng": self._rng.bit_generator.state, **waiting, **rates})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         values = state.values
         self._next = values["next"]
         self._rng.bit_generator.state = values["rng"]
-        self._failed = [Ticket(*ticket) for ticket in values["failed"]]
+        # Runs that began before levels were mined have none.
+        self._failed, self._lost = ([Ticket(*x) for x in values.get(name, ())] for name in ("failed", "lost"))
         self._solved, self._tried = np.array(values["solved"]), np.array(values["tried"])
+
+    def _pop(self, tickets: list[Ticket]) -> Ticket:
+        """Take one of them out, whichever."""
+        return tickets.pop(int(self._rng.integers(len(tickets))))
 
 
 def _boards(tickets: Sequence[Ticket]) -> BitBoards:

@@ -176,13 +176,30 @@ def test_levels_that_were_not_solved_come_again_and_the_mix_follows_what_is_solv
         TrainingLevels(-1)
 
 
+def test_levels_that_were_lost_at_first_come_until_they_have_been_won_several_times():
+    levels = TrainingLevels(0, mined=0.5)
+    lost, won = levels.draw(2)[1]
+    levels.rate(lost, solved=False)
+    levels.rate(won, solved=True)
+    rates = levels.success_rates.tolist()
+    wins = 0
+    for _ in range(1000):
+        (ticket,) = levels.draw(1)[1]
+        if ticket.mined:
+            assert ticket == lost._replace(mined=True)
+            levels.rate(ticket, solved=True)
+            wins += 1
+    assert 1 < wins < 200, "about ten times"
+    assert levels.success_rates.tolist() == rates, "the mix follows first tries"
+
+
 def test_another_seed_plays_other_levels_by_another_chance_and_all_are_for_training():
     seen, chances = [], []
     for seed in (0, 1):
         for stream in (0, 1):
             actor = SearchActor(NETWORK, SMALL, seed, stream)
             actor.act()
-            seen += [level for _, level, _ in actor.state().part("own").values["tickets"]]
+            seen += [level for _, level, *_ in actor.state().part("own").values["tickets"]]
             chances.append(float(actor._rng.random()))
     assert len(set(seen)) == 4 * SMALL.trees and all(x in TRAIN_SEEDS for x in seen)
     assert len(set(chances)) == 4
@@ -216,7 +233,7 @@ def test_a_run_plays_the_levels_of_its_seed(tmp_path):
         trainer = run(tmp_path / str(seed), seed)
         actor = trainer.source.pool.factory(0)
         actor.act()
-        levels.append({level for _, level, _ in actor.state().part("own").values["tickets"]})
+        levels.append({level for _, level, *_ in actor.state().part("own").values["tickets"]})
     assert not levels[0] & levels[1]
 
 
