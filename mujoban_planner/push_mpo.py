@@ -23,7 +23,7 @@ from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards, signed
 from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
 from mujoban_planner.push_policy import PushPolicy, images
-from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
+from mujoban_planner.push_run import PushRunConfig, starting_anchor, starting_policy, training_record
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.validation import success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
@@ -86,6 +86,7 @@ class PushMPOLearner(Learner[Window]):
         """Build a policy, or start from a planner's weights."""
         self.config = config
         self.policy = starting_policy(config)
+        self._anchor = starting_anchor(config, self.policy)
         self._average = moving_average(self.policy, config.average, warm_up=True)
         self.mpo = DiscreteMPO(config.mpo)
         self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5, fused=True)
@@ -134,9 +135,15 @@ class PushMPOLearner(Learner[Window]):
         taken = output.q.gather(1, images(batch["push"][:, 0].numpy(), symmetry)[:, None])[:, 0]
         q_loss = functional.smooth_l1_loss(taken, goal)
         loss = policy_loss + config.q_weight * q_loss
+        parts = {"q_loss": q_loss}
+        if self._anchor is not None:
+            with autocast("cpu"):
+                parts["anchor"] = self._anchor.loss(self.policy.planner, first, symmetry)
+            loss = loss + parts["anchor"]
         if guarded_step(loss, [self._adam, self._dual_adam], guard, clip=5.0) is not None:
             self._average.update_parameters(self.policy)
-        return scalars(stats._asdict()) | {"q_loss": float(q_loss.detach()), "mean_return": float(goal.mean())}
+        parts["mean_return"] = goal.mean()
+        return scalars(stats._asdict()) | {name: float(value.detach()) for name, value in parts.items()}
 
     def weights(self) -> Mapping[str, Tensor]:
         """Return the policy's weights."""

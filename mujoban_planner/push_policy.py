@@ -5,6 +5,7 @@ Shapes: B states, C channels, I = 8; A = 256 pushes, the flat index 64 * directi
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_planner.boards import BitBoards, state_tensor
+from mujoban_planner.heads import PlannerOutput
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.push_env import possible_masks
 from mujoban_planner.reinforcement import silence_verdicts
@@ -40,7 +42,7 @@ class PushPolicy(nn.Module):
 
     The other heads get no gradient. Of a network that nothing was taught, those that would have a say in the planner's
     decision are masked, so that it goes by the push head alone; of another they keep their say, as they were taught
-    before, and read a trunk that goes on changing under them.
+    before, which an `Anchor` holds them to while the trunk that they read goes on changing under them.
     """
 
     def __init__(self, planner: LearnedPlanner, *, untaught: bool) -> None:
@@ -73,9 +75,7 @@ class PushPolicy(nn.Module):
 
     def forward(self, boards: BitBoards, symmetry: NDArray[np.int64] | None = None) -> PushOutput:
         """Return what the policy says of states, each under its symmetry if given, [B]."""
-        possible = torch.from_numpy(possible_masks(boards))
-        if symmetry is not None:
-            possible = torch.zeros_like(possible).scatter_(1, push_images(SIDE)[torch.from_numpy(symmetry)], possible)
+        possible = _possible(boards, symmetry)
         features, _, _ = self.planner.perceive(state_tensor(boards, symmetry))
         features = functional.relu(features)
         logits = self.planner.heads.push(features).flatten(1).float()
@@ -83,6 +83,62 @@ class PushPolicy(nn.Module):
         value = self.board(pooled)[:, 0].float()
         q = value[:, None] + self.pushes(features).flatten(1).float()
         return PushOutput(logits.masked_fill(~possible, _IMPOSSIBLE), value, q.masked_fill(~possible, 0.0))
+
+
+class Anchor:
+    """What a planner said when a run began, for the heads that the run does not teach."""
+
+    def __init__(self, planner: LearnedPlanner, weight: float, share: float) -> None:
+        """Keep a copy of the planner.
+
+        Args:
+            planner: As it is when the run begins.
+            weight: Of the loss.
+            share: Share of the states of a batch in which it is asked, from the first on.
+        """
+        self._before = deepcopy(planner).eval().requires_grad_(False)
+        self._weight, self._share = weight, share
+
+    def loss(self, planner: LearnedPlanner, boards: BitBoards, symmetry: NDArray[np.int64] | None = None) -> Tensor:
+        """Return how far the planner's policy, plan map, verdicts and Q have come from those of the beginning.
+
+        Cross-entropies less what they are at least, and the smooth L1 distance of Q: 0 where nothing has changed.
+
+        Args:
+            planner: The one that learns.
+            boards: States, [B].
+            symmetry: Of each, [B]; none by default.
+        """
+        n = max(1, round(self._share * len(boards.box)))
+        boards = BitBoards._make(column[:n] for column in boards)
+        symmetry = None if symmetry is None else symmetry[:n]
+        state = state_tensor(boards, symmetry)
+        before: PlannerOutput = self._before(state)
+        now: PlannerOutput = planner(state)
+        loss = functional.smooth_l1_loss(now.q, before.q)
+        for new, old in ((now.policy, before.policy), (now.plan, before.plan)):
+            spread = functional.kl_div(new.log_softmax(1), old.log_softmax(1), reduction="none", log_target=True)
+            loss = loss + spread.sum(1).mean()
+        loss = loss + _bernoulli_divergence(now.dead, before.dead).mean()
+        if now.push_dead is not None and before.push_dead is not None:
+            # Of pushes that are not possible nobody asks.
+            possible = _possible(boards, symmetry).view_as(now.push_dead)
+            loss = loss + _bernoulli_divergence(now.push_dead, before.push_dead)[possible].mean()
+        return self._weight * loss
+
+
+def _possible(boards: BitBoards, symmetry: NDArray[np.int64] | None) -> Tensor:
+    """Return which pushes are possible in states as they stand under their symmetries, [B, A]."""
+    possible = torch.from_numpy(possible_masks(boards))
+    if symmetry is None:
+        return possible
+    return torch.zeros_like(possible).scatter_(1, push_images(SIDE)[torch.from_numpy(symmetry)], possible)
+
+
+def _bernoulli_divergence(new: Tensor, old: Tensor) -> Tensor:
+    """Return KL(old || new) of probabilities given as logits, element by element."""
+    p = old.sigmoid()
+    return functional.softplus(new) - functional.softplus(old) - p * (new - old)
 
 
 def images(pushes: NDArray[np.int64], symmetry: NDArray[np.int64]) -> Tensor:

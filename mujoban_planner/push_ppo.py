@@ -19,7 +19,7 @@ from torch.distributions import Categorical
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards
 from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
-from mujoban_planner.push_run import PushRunConfig, starting_policy, training_record
+from mujoban_planner.push_run import PushRunConfig, starting_anchor, starting_policy, training_record
 from mujoban_planner.validation import success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Arrays, Rollouts
 from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
@@ -66,6 +66,7 @@ class PushPPOLearner(Learner[Arrays]):
         """Build a policy, or start from a planner's weights."""
         self.config = config
         self.policy = starting_policy(config)
+        self._anchor = starting_anchor(config, self.policy)
         self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5, fused=True)
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up))
         self._rng = np.random.default_rng([config.seed, 7])
@@ -107,8 +108,14 @@ class PushPPOLearner(Learner[Arrays]):
                 log_prob = policy.log_prob(push[rows])
                 loss, stats = ppo_loss(log_prob, old[rows], advantage[rows], output.value, target[rows], config.ppo)
                 entropy = policy.entropy().mean()
-                guarded_step(loss - config.entropy * entropy, [self._adam], guard, clip=1.0)
-                for name, value in {**stats, "entropy": entropy}.items():
+                parts = {**stats, "entropy": entropy}
+                loss = loss - config.entropy * entropy
+                if self._anchor is not None:
+                    with autocast("cpu"):
+                        parts["anchor"] = self._anchor.loss(self.policy.planner, states)
+                    loss = loss + parts["anchor"]
+                guarded_step(loss, [self._adam], guard, clip=1.0)
+                for name, value in parts.items():
                     means.setdefault(name, []).append(float(value.detach()))
         return {f"ppo/{name}": float(np.mean(values)) for name, values in means.items()}
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from mujoban_core.ranges import check_counts
+from mujoban_core.ranges import check_counts, check_not_negative, check_shares
 from mujoban_planner.growth import start_from
-from mujoban_planner.push_policy import PushPolicy
+from mujoban_planner.push_policy import Anchor, PushPolicy
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Budget
 from mujoban_rl.weights import lineage, origin, provenance
@@ -32,11 +32,18 @@ class PushRunConfig(NetworkConfig):
     updates: float = 1e9
     """Updates after which it is complete."""
     seed: int = 0
+    anchor: float = 1.0
+    """Of a run that starts from weights: how much it counts that heads which it does not teach go on saying what they
+    said; 0 lets them drift."""
+    anchored: float = 0.25
+    """Share of a batch's states in which they are asked."""
 
     def __post_init__(self) -> None:
         """Reject networks of nothing and seeds that there are not."""
         check_counts(self, "channels", "blocks")
         check_counts(self, "seed", least=0)
+        check_not_negative(self, "anchor")
+        check_shares(self, "anchored")
 
     @property
     def budget(self) -> Budget:
@@ -52,6 +59,11 @@ def starting_policy(config: PushRunConfig) -> PushPolicy:
         start_from(network, Path(config.init))
     network.lay_out()
     return PushPolicy(network, untaught=config.init is None)
+
+
+def starting_anchor(config: PushRunConfig, policy: PushPolicy) -> Anchor | None:
+    """Return what holds a policy that has learned nothing yet to its planner; None if no weights were given, or 0."""
+    return Anchor(policy.planner, config.anchor, config.anchored) if config.init is not None and config.anchor else None
 
 
 def training_record(method: str, config: PushRunConfig) -> dict[str, Any]:

@@ -10,11 +10,12 @@ from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.push_actor import PlayConfig
 from mujoban_planner.push_env import PUSHES
 from mujoban_planner.push_mpo import PushMPOConfig, PushReplay, push_mpo
-from mujoban_planner.push_policy import PushPolicy, images
+from mujoban_planner.push_policy import Anchor, PushPolicy, images
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
 from mujoban_rl.actors import Experience
 from mujoban_rl.engine import Cadence
 from mujoban_rl.testing import check_refusal, check_resuming
+from mujoban_rl.weights import save_weights
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 
 PLAY = PlayConfig(environments=16, steps=4)
@@ -26,15 +27,16 @@ def one_thread():
     torch.set_num_threads(1)
 
 
-def ppo(path, seed=0):
-    config = PushPPOConfig(play=PLAY, minibatch=32, seed=seed, **SIZE)
+def ppo(path, seed=0, **options):
+    config = PushPPOConfig(play=PLAY, minibatch=32, seed=seed, **SIZE, **options)
     trainer = push_ppo(config, path, Cadence(publish_updates=1, save_seconds=math.inf))
     trainer.learner.evaluate = dict
     return trainer
 
 
-def mpo(path, seed=0):
-    config = PushMPOConfig(play=PLAY, batch_size=32, first_steps=256, replay_steps=40, n_step=3, seed=seed, **SIZE)
+def mpo(path, seed=0, **options):
+    settings = {"batch_size": 32, "first_steps": 256, "replay_steps": 40, "n_step": 3, **SIZE, **options}
+    config = PushMPOConfig(play=PLAY, seed=seed, **settings)
     trainer = push_mpo(config, path, Cadence(publish_updates=2, save_seconds=math.inf))
     trainer.learner.evaluate = dict
     return trainer
@@ -48,7 +50,7 @@ def test_runs_resume_to_the_bit(make, tmp_path):
 @pytest.mark.parametrize("make", [ppo, mpo])
 def test_another_seed_plays_other_levels_by_another_chance(make, tmp_path):
     states = [make(tmp_path / str(seed), seed).source.pool.factory(0).state() for seed in (0, 5)]
-    levels = [{level for _, level, _ in state.part("own").values["tickets"]} for state in states]
+    levels = [{level for _, level, *_ in state.part("own").values["tickets"]} for state in states]
     assert not levels[0] & levels[1] and all(level in TRAIN_SEEDS for level in levels[0] | levels[1])
     one, other = (state.part("own").tensors["generator"] for state in states)
     assert not torch.equal(one, other)
@@ -97,6 +99,29 @@ def test_a_replay_goes_on_with_more_or_fewer_actors():
     assert set(more.sample()["target"].flatten().tolist()) == {5, 6}
     fewer.restore(more.state())
     assert len(fewer.replay) == len(replay.replay) and fewer.sample()["wall"].min() > 0
+
+
+@pytest.mark.parametrize("make", [ppo, mpo])
+def test_a_run_from_weights_keeps_what_they_say_in_heads_that_it_does_not_teach(make, tmp_path):
+    start = ResidualPlanner(8, 1, judge=True)
+    save_weights(tmp_path / "start.safetensors", start, start.config, {})
+    states = torch.from_numpy(abstract_states(generate_batch(4, range(16))))
+    drift = {}
+    for anchor in (0.0, 10.0):
+        options = {"init": str(tmp_path / "start.safetensors"), "anchor": anchor, "anchored": 1.0}
+        trainer = make(tmp_path / str(anchor), learning_rate=1e-2, **options)
+        trainer.run()
+        planner = trainer.learner.policy.planner.eval()
+        with torch.no_grad():
+            drift[anchor] = float((planner(states).push_dead - start.eval()(states).push_dead).abs().mean())
+    assert 0.0 < drift[10.0] < 0.7 * drift[0.0]
+
+
+def test_nothing_pulls_at_a_planner_that_says_what_it_said_under_any_symmetry():
+    planner = ResidualPlanner(8, 1, judge=True).eval()
+    boards = bit_boards(generate_batch(4, range(8)))
+    loss = Anchor(planner, 1.0, 1.0).loss(planner, boards, np.arange(8))
+    assert abs(float(loss.detach())) < 1e-5
 
 
 def test_no_return_runs_from_the_levels_of_an_actor_that_died_into_those_of_its_successor():
