@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,8 +119,7 @@ class CameraPlayer(TaskPlayer):
     def __init__(self, task: GoalTask, policy: VisuomotorController, generator: torch.Generator) -> None:
         """Play with a copy of `policy`, where it is, and randomness from `generator`, which is on the CPU."""
         self.task, self.generator = task, generator
-        self._policy = VisuomotorController(**policy.config).to(policy.device)
-        self._policy.mixed_precision = policy.mixed_precision
+        self._policy = deepcopy(policy)
         self._memory: Memory = self._policy.initial_memory(task.world.batch)
 
     @property

@@ -19,6 +19,7 @@ if __name__ == "__main__":
     end_at_once()
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -228,9 +229,7 @@ class _Parts:
         return self._replay(player, settings, self._recorded(policy, rows, teacher), rows)
 
     def _recorded(self, policy: VisuomotorController, rows: int, teacher: PrivilegedPolicy | None) -> BagPlayer:
-        own = VisuomotorController(**policy.config).to(policy.device)
-        own.load_state_dict(policy.state_dict())
-        own.mixed_precision = policy.mixed_precision
+        own = deepcopy(policy)
         rng = np.random.default_rng(next(self._streams))
         return BagPlayer(BagTicks(self.options.bags, self.config.task, own, rows, rng, teacher), own)
 
