@@ -29,6 +29,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from bringup.options import Count, WorldOptions, whole
 from bringup.pipeline import Pipeline, Stage
 from bringup.training_report import EVALUATIONS, write_report
+from bringup.training_sizes import Machine
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.program import read_options, run_command
 from mujoban_planner.training_levels import LAST_SEED
@@ -96,10 +97,6 @@ _STUDENT: Final = (
 do under pushes that are not possible weighs less, so that it tries those where it can't tell."""
 _SENSES: Final = ("--learner.slip", "0.015", "--learner.lost", "0.05")
 """How far the odometer is off in training of estimator and termination."""
-_STREAMS_ALONE: Final = 5
-"""Rows of their batch on one core."""
-_STREAMS_EACH: Final = 3
-"""And for each of several."""
 _VIEWS: Final = ("--noise", "0.1", "--hidden", "0.3")
 """Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
 _LEVELS: Final = {"bags_first": 1, "bags_second": 2}
@@ -126,6 +123,8 @@ class Options:
     physics: Annotated[WorldOptions, tyro.conf.arg(name="")] = field(default_factory=WorldOptions)
     seed: Annotated[int, whole("N", 0)] = 0
     cores: Count = 2
+    device: str = "cpu"
+    """Device on which networks learn. A GPU has larger batches, a larger planner, and its time by the clock."""
     evaluation_episodes: Count = 128
     """Validation levels that each table of the report counts."""
 
@@ -139,6 +138,11 @@ class Options:
         missing = [] if self.before is None else [path for path in needed if not (self.before / path).exists()]
         if missing:
             raise ValueError(f"--continue {self.before}: lacks {missing[0]}, expected the directory of a finished run")
+
+    @property
+    def machine(self) -> Machine:
+        """What trains."""
+        return Machine(self.cores, self.device)
 
 
 def stages(options: Options) -> list[Stage]:
@@ -169,7 +173,7 @@ def _sources(options: Options, *products: str) -> tuple[Path, ...]:
 
 def _trainer(
     options: Options, name: str, command: Sequence[str], product: str, *needs: str, beside: Sequence[str] = (),
-    sources: Sequence[Path] = (), cores: int = 1,
+    sources: Sequence[Path] = (),
 ) -> Stage:  # fmt: skip
     """Return a stage that trains for its share of the hours, which no limit of steps cuts short.
 
@@ -181,14 +185,14 @@ def _trainer(
         needs: Stages before it.
         beside: What it makes beside its product.
         sources: What it takes from elsewhere.
-        cores: What it keeps busy.
     """
-    seconds = _seconds(options, name)
-    budget = ("--cpu-seconds", str(round(_SAVED * seconds * cores)))
-    folder = options.run / name
-    arguments = ("-m", *command, "--run", str(folder), *budget)
+    seconds, machine = _seconds(options, name), options.machine
+    arguments = ("-m", *command, "--run", str(options.run / name), *machine.budget(name, _SAVED * seconds))
     outputs = tuple(options.run / path for path in (product, *beside))
-    return Stage(name, arguments, outputs, needs, seconds, cores, sources=tuple(sources))
+    return Stage(
+        name, (*arguments, *machine.sizes(name)), outputs, needs, seconds, machine.cores_of(name),
+        sources=tuple(sources),
+    )  # fmt: skip
 
 
 def _controller(options: Options) -> list[Stage]:
@@ -252,10 +256,8 @@ def _senses(options: Options) -> list[Stage]:
         bags.append(str(options.run / recording))
         name = f"estimator_{round_}"
         out = options.run / name / "weights"
-        cores = 1 if round_ == "first" else options.cores
-        streams = _STREAMS_ALONE if cores == 1 else _STREAMS_EACH * cores
         command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out)]
-        command += ["--validation", str(validation.products[0]), "--streams", str(streams), "--shards", str(cores)]
+        command += ["--validation", str(validation.products[0])]
         every = max(1, round(_SENSES_EVALUATIONS * options.hours))
         command += ["--evaluate-every", str(every), "--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
         for part in ("estimator", "termination"):
@@ -264,7 +266,7 @@ def _senses(options: Options) -> list[Stage]:
             command += ["--start", str(start)]
         start = out
         needs.append(recording)
-        found.append(_trainer(options, name, command, f"{name}/weights", *needs, sources=sources, cores=cores))
+        found.append(_trainer(options, name, command, f"{name}/weights", *needs, sources=sources))
         needs.append(name)
     return found
 
@@ -287,8 +289,7 @@ def _validation(options: Options) -> Stage:
 def _recording(options: Options, name: str) -> Stage:
     """Return a stage that records bags: the first of what has learned until then, with perfect sense, then of all."""
     run, first = options.run, name == "bags_first"
-    # Controller and planner are not ready at the same time, and what is begun then on one core is not to wait for two.
-    cores = 1 if first else options.cores
+    cores = options.machine.cores_of(name)
     if first:
         needs = {"controller": "controller_distil", "planner": "planner"}
         acting = {"controller": PRODUCTS["student"], "planner": PRODUCTS["whole"]}
@@ -297,7 +298,7 @@ def _recording(options: Options, name: str) -> Stage:
         acting = {role: WEIGHTS[role].replace("estimator_second", "estimator_first") for role in WEIGHTS}
     sense = ("--oracle", "estimator,termination") if first else ()
     modules = tuple(x for role, path in acting.items() for x in (f"--{role}", str(run / path)))
-    episodes = max(8, round(_EPISODES_PER_HOUR * options.hours))
+    episodes = max(8, round(_EPISODES_PER_HOUR * options.hours * options.machine.episodes))
     limit = _RECORDED_STEPS * get_body(options.physics.body).time_limit // BALL.time_limit
     stream = len(_LEVELS) * options.seed + _LEVELS[name]
     seed = TRAIN_SEEDS.start + stream * 10**9

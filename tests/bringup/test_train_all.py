@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 import bringup.evaluate
 import bringup.record
@@ -140,7 +141,12 @@ def test_every_stage_but_the_planners_is_told_the_body_and_the_world(tmp_path: P
 
 
 @pytest.mark.parametrize("continued", [False, True])
-def test_programs_know_the_options_that_they_are_given(tmp_path: Path, continued: bool) -> None:
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_programs_know_the_options_that_they_are_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, continued: bool, device: str
+) -> None:
+    # What is told of a GPU can be read where there is none.
+    monkeypatch.setattr(mujoban_controller.train, "usable_device", torch.device)
     before = finished(tmp_path / "before") if continued else None
     programs: dict[str, Any] = {
         "mujoban_controller.train": mujoban_controller.train.Options,
@@ -149,9 +155,24 @@ def test_programs_know_the_options_that_they_are_given(tmp_path: Path, continued
         "bringup.record": bringup.record.Options,
         "bringup.evaluate": bringup.evaluate.Options,
     }
-    for name, command in commands(Options(run=tmp_path / "run", before=before)).items():
+    for name, command in commands(Options(run=tmp_path / "run", before=before, device=device, cores=16)).items():
         options = read_options(programs[command[1]], command[2:], name)
         assert getattr(options, "run", tmp_path / "run" / name) == tmp_path / "run" / name
+
+
+def test_a_gpu_is_given_its_time_by_the_clock_and_work_for_all_cores_beside_it(tmp_path: Path) -> None:
+    run = Options(run=tmp_path, hours=0.5, device="cuda", cores=16)
+    found = {stage.name: stage for stage in stages(run)}
+    trainings = [stage for stage in found.values() if "--run" in stage.command]
+    assert len(trainings) == 7
+    for stage in trainings:
+        command = stage.command
+        assert command[command.index("--device") + 1] == "cuda"
+        assert 0.9 * stage.seconds < float(command[command.index("--horizon-seconds") + 1]) < stage.seconds
+        assert float(command[command.index("--cpu-seconds") + 1]) > 100 * run.hours * 3600
+    for side_by_side in (("controller_distil", "planner"), ("controller_mpo", "planner_views", "estimator_first")):
+        assert 12 <= sum(found[name].cores for name in side_by_side) <= run.cores
+    assert found["estimator_second"].cores == run.cores
 
 
 def test_the_report_stands_beside_weights_with_their_cards(tmp_path: Path) -> None:

@@ -1,0 +1,82 @@
+"""How large the trainings of `make weights` are: on CPU cores, or with a GPU.
+
+Cores alone are given CPU seconds, so that a run comes to the same on a busy machine. A GPU is given seconds by the
+clock, batches that keep it busy, and cores that play, search and read for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+_NEVER: Final = "1000000000"
+"""CPU seconds that nothing uses up."""
+_SEARCHING: Final = (
+    "--trees", "768", "--batch-size", "2048", "--buffer", "1500000", "--first-evaluations", "60000",
+    "--evaluations", "3", "--expansions", "80", "--questions", "60",
+    "--architecture", "thinking", "--channels", "64", "--blocks", "12", "--tied", "6", "--thoughts", "1", "2", "1", "4",
+    "--actors", "processes", "--schedule", "first",
+)  # fmt: skip
+"""Of the planner: a larger network, whose searches run beside its learner, and larger ones."""
+_ON_GPU: Final[Mapping[str, tuple[str, ...]]] = {
+    "controller_distil": ("--task.batch", "192", "--distil.windows", "64", "--distil.first", "8000"),
+    "planner": (*_SEARCHING, "--learning-rate", "2e-3"),
+    "planner_views": _SEARCHING,
+    "estimator_first": ("--streams", "48", "--learner.window-frames", "512", "--learning-rate", "2.5e-3"),
+    "estimator_second": ("--streams", "48", "--learner.window-frames", "512", "--learning-rate", "2e-3"),
+}
+"""What trainings are told on a GPU, as its first weights learned (docs/research/weights.md)."""
+_HALF: Final = ("planner", "planner_views", "bags_first")
+"""Stages that keep half of the cores beside a GPU busy; the others that run side by side have a quarter."""
+_ALL: Final = ("bags_second", "estimator_second")
+"""Those that have a machine to themselves."""
+_STREAMS_ALONE: Final = 5
+"""Rows of the senses' batch on one core."""
+_STREAMS_EACH: Final = 3
+"""And for each of several."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What trains."""
+
+    cores: int
+    device: str
+    """Of the networks, as PyTorch names it."""
+
+    @property
+    def gpu(self) -> bool:
+        """Whether networks learn elsewhere than on the cores."""
+        return self.device != "cpu"
+
+    @property
+    def episodes(self) -> int:
+        """How many times as many recorded episodes an hour's training has use for, as on cores alone."""
+        return 2 if self.gpu else 1
+
+    def cores_of(self, stage: str) -> int:
+        """Return the cores that a stage keeps busy."""
+        if stage in _ALL:
+            return self.cores
+        # Without a GPU, what is begun on one core is not to wait for two: others run beside.
+        return max(1, self.cores // (2 if stage in _HALF else 4)) if self.gpu else 1
+
+    def budget(self, stage: str, seconds: float) -> tuple[str, ...]:
+        """Return the options by which a training ends after its share of the time, by the clock."""
+        if self.gpu:
+            return ("--device", self.device, "--cpu-seconds", _NEVER, "--horizon-seconds", str(round(seconds)))
+        return ("--cpu-seconds", str(round(seconds * self.cores_of(stage))))
+
+    def sizes(self, stage: str) -> tuple[str, ...]:
+        """Return the options that say how large a training is."""
+        cores = self.cores_of(stage)
+        senses = stage.startswith("estimator")
+        if not self.gpu:
+            streams = _STREAMS_ALONE if cores == 1 else _STREAMS_EACH * cores
+            return ("--streams", str(streams), "--shards", str(cores)) if senses else ()
+        if senses:
+            helpers = ("--shards", "1", "--workers", str(cores))
+        else:
+            helpers = ("--num-actors" if stage.startswith("planner") else "--threads", str(cores))
+        return (*_ON_GPU.get(stage, ()), *helpers)
