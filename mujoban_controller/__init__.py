@@ -18,14 +18,21 @@ def teacher_weights(body: str) -> Path:
     return _WEIGHTS / f"teacher_{body}.safetensors"
 
 
-def load(path: str | Path | None = None, device: str = "cpu") -> Controller:
+def load(path: str | Path | None = None, device: str = "cpu", *, compiled: bool = True) -> Controller:
     """Return the controller with the given or the shipped weights: a camera policy, or a privileged teacher.
 
+    Args:
+        path: A `.safetensors` file with its record beside; the shipped weights by default.
+        device: Where the network is put.
+        compiled: Whether to look for a graph of it, which only ticks of single robots on a CPU need.
+
     Raises:
-        mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit.
+        mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit, or their graph is damaged.
     """
+    from mujoban_controller.compiled import TICK, examples
     from mujoban_controller.controller import VisuomotorController
     from mujoban_controller.privileged import PrivilegedPolicy
+    from mujoban_rl.compiled import load_graph
     from mujoban_rl.weights import load_weights, read_record
 
     file = Path(path or SHIPPED)
@@ -33,4 +40,7 @@ def load(path: str | Path | None = None, device: str = "cpu") -> Controller:
         from mujoban_controller.privileged_controller import PrivilegedController
 
         return PrivilegedController(load_weights(PrivilegedPolicy, file, device))
-    return load_weights(VisuomotorController, file, device)
+    controller = load_weights(VisuomotorController, file, device)
+    if compiled and controller.device.type == "cpu":
+        controller.compiled = load_graph(file, read_record(file), TICK, controller.tick, examples(controller))
+    return controller

@@ -17,7 +17,7 @@ Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CONTROL_PERIOD, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
+from mujoban_rl.compiled import CompiledGraph
 from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder, gaussian, gaussian_layers, rows_of_sky
 
 INPUT_FIELDS = ("frame", "proprio", "instruction", "terminated")
@@ -136,6 +137,8 @@ class VisuomotorController(GoalPolicy, Controller):
         self.body = body
         self.mixed_precision = False
         """Whether the ResNet may compute in bfloat16: in training, not on the robot, so that runs repeat exactly."""
+        self.compiled: CompiledGraph | None = None
+        """`tick` for a single robot as an exported graph, of the weights that were loaded."""
         self.joints = len(layout.joints)
         self.proprio_size, self.action_size, self.hidden = layout.proprio_size, layout.action_size, hidden
         self.heading_index = layout.heading_index
@@ -321,17 +324,44 @@ class VisuomotorController(GoalPolicy, Controller):
     @torch.inference_mode()
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return the mean torque limited to [-1, 1], [B, U], and the next memory."""
-        output = self.forward(*self.to_tensors(inputs), memory=Recurrent(*state))
-        return output.action.mean[:, 0].clamp(-1.0, 1.0).cpu().numpy(), output.memory
+        arrays = _arrays(inputs)
+        if self.compiled is not None and len(inputs.frame) == 1:
+            torque, *memory = self.compiled([*arrays, *(part.numpy() for part in state)])
+            return torque, Recurrent(*map(torch.from_numpy, memory))
+        torque, *memory = self.tick(*(torch.from_numpy(a).to(self.device) for a in arrays), *state)
+        return torque.cpu().numpy(), Recurrent(*memory)
+
+    def tick(
+        self, frame: Tensor, proprio: Tensor, instruction: Tensor, terminated: Tensor, output: Tensor, cell: Tensor,
+        track: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        """Return the mean torque limited to [-1, 1], [B, U], and the three parts of the next memory.
+
+        It is what `mujoban_controller.export` exports, hence tensors alone: those of `forward` in one tick, [B, ...],
+        and the parts of `Recurrent`.
+        """
+        sequences = (x.unsqueeze(1) for x in (frame, proprio, instruction, terminated))
+        result = self.forward(*sequences, memory=Recurrent(output, cell, track))
+        return (result.action.mean[:, 0].clamp(-1.0, 1.0), *result.memory)
+
+    def train(self, mode: bool = True) -> Self:
+        """Set training mode, whose new weights the compiled tick would not have."""
+        if mode:
+            self.compiled = None
+        return super().train(mode)
 
     def to_tensors(self, inputs: ControllerInput) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return one tick's observations, [B, ...], as sequences of one tick, [B, 1, ...], on the module's device."""
-        device = self.device
-        arrays = (
-            np.ascontiguousarray(inputs.frame),
-            np.asarray(inputs.proprio, np.float32),
-            np.asarray(inputs.instruction, np.int64),
-            np.asarray(inputs.terminated, np.bool_),
-        )
-        frame, proprio, instruction, terminated = (torch.from_numpy(a).to(device).unsqueeze(1) for a in arrays)
+        tensors = (torch.from_numpy(a).to(self.device).unsqueeze(1) for a in _arrays(inputs))
+        frame, proprio, instruction, terminated = tensors
         return frame, proprio, instruction, terminated
+
+
+def _arrays(inputs: ControllerInput) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return one tick's observations, [B, ...], as arrays that tensors can be made of."""
+    return (
+        np.ascontiguousarray(inputs.frame),
+        np.asarray(inputs.proprio, np.float32),
+        np.asarray(inputs.instruction, np.int64),
+        np.asarray(inputs.terminated, np.bool_),
+    )

@@ -27,13 +27,26 @@ def load(path: str | Path | None = None, device: str = "cpu") -> StateEstimator:
     return load_weights(StateEstimator, path or SHIPPED, device)
 
 
-def load_termination(path: str | Path | None = None, device: str = "cpu") -> ControlTermination:
+def load_termination(
+    path: str | Path | None = None, device: str = "cpu", *, compiled: bool = True
+) -> ControlTermination:
     """Return the learned control termination with the given or the shipped weights.
 
-    Raises:
-        mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit.
-    """
-    from mujoban_estimator.termination import ControlTermination
-    from mujoban_rl.weights import load_weights
+    Args:
+        path: A `.safetensors` file with its record beside; the shipped weights by default.
+        device: Where the network is put.
+        compiled: Whether to look for a graph of it, which only ticks of single robots on a CPU need.
 
-    return load_weights(ControlTermination, path or SHIPPED_TERMINATION, device)
+    Raises:
+        mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit, or their graph is damaged.
+    """
+    from mujoban_estimator.compiled import TICK, examples
+    from mujoban_estimator.termination import ControlTermination
+    from mujoban_rl.compiled import load_graph
+    from mujoban_rl.weights import load_weights, read_record
+
+    file = Path(path or SHIPPED_TERMINATION)
+    termination = load_weights(ControlTermination, file, device)
+    if compiled and termination.device.type == "cpu":
+        termination.compiled = load_graph(file, read_record(file), TICK, termination.tick, examples(termination))
+    return termination

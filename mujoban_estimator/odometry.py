@@ -127,7 +127,9 @@ def _follow(track: Track, velocity: Tensor, direction: Tensor, terminated: Tenso
     """Return the tracks after each tick, [B, T, ...], of a track before the first; all ticks at once."""
     ticks = torch.arange(1, terminated.shape[1] + 1, device=terminated.device)
     # When the instruction in force was issued: 0 before the first tick.
-    issued = torch.where(terminated, ticks, torch.zeros_like(ticks)).cummax(dim=1).values
+    issued = torch.where(terminated, ticks, torch.zeros_like(ticks))
+    if len(ticks) > 1:  # ONNX, in which single ticks are compiled, has no running maximum
+        issued = issued.cummax(dim=1).values
     steps = 0.5 * CONTROL_PERIOD * (_behind(track.velocity, velocity) + velocity)
     positions = torch.cat([track.position[:, None], steps], dim=1).cumsum(dim=1)
     before = _behind(track.direction, direction)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from mujoban_core.interfaces import Memory, Termination, TerminationInput
 from mujoban_core.ranges import check_counts
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.odometry import FEATURES, Odometry, Track, turn
+from mujoban_rl.compiled import CompiledGraph
 
 PHASES: Final = 4
 """Cosine and sine of the robot's place within its cell, along and across the instruction."""
@@ -93,6 +94,8 @@ class ControlTermination(nn.Module, Termination):
         self.phases = nn.Linear(c.camera, PHASES)
         self.lstm = nn.LSTM(c.camera + FEATURES + body.proprio_size, c.hidden, batch_first=True)
         self.verdict = nn.Sequential(nn.Linear(c.hidden, c.hidden), nn.ReLU(), nn.Linear(c.hidden, 1))
+        self.compiled: CompiledGraph | None = None
+        """`tick` for a single robot as an exported graph, of the weights that were loaded."""
         nn.init.constant_(self.verdict[-1].bias, _PRIOR_LOGIT)  # pyright: ignore[reportArgumentType]
 
     @property
@@ -147,16 +150,47 @@ class ControlTermination(nn.Module, Termination):
         if not np.isfinite(inputs.proprio).all():
             raise ValueError(f"proprioception {inputs.proprio.tolist()}: expected finite numbers")
         hidden, cell, track = memory
-        device = self.device
-        terminated = torch.from_numpy(np.asarray(inputs.terminated)).to(device)
-        proprio = torch.from_numpy(inputs.proprio).to(device)[:, None]
-        instruction = torch.from_numpy(np.asarray(inputs.instruction)).to(device)
-        progress, track = self.odometry(proprio, instruction[:, None], terminated[:, None], track)
+        arrays = (
+            np.ascontiguousarray(inputs.frame), np.asarray(inputs.proprio, np.float32),
+            np.asarray(inputs.instruction, np.int64), np.asarray(inputs.terminated, np.bool_),
+        )  # fmt: skip
+        if self.compiled is not None and len(inputs.frame) == 1:
+            probability, *after = self.compiled([*arrays, *(part.numpy() for part in (hidden, cell, *track))])
+            hidden, cell, *parts = map(torch.from_numpy, after)
+        else:
+            tensors = (torch.from_numpy(x).to(self.device) for x in arrays)
+            output, hidden, cell, *parts = self.tick(*tensors, hidden, cell, *track)
+            probability = output.cpu().numpy()
+        return probability, TerminationMemory(hidden, cell, Track(*parts))
+
+    def tick(
+        self, frame: Tensor, proprio: Tensor, instruction: Tensor, terminated: Tensor, hidden: Tensor, cell: Tensor,
+        *track: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        """Return p(A_{t-1} is completed), [B], and the parts of the next memory.
+
+        It is what `mujoban_estimator.export` exports, hence tensors alone.
+
+        Args:
+            frame: o_cam, uint8 [B, 64, 64, 3].
+            proprio: o_pr, [B, P].
+            instruction: A_{t-1}, int64 [B].
+            terminated: beta_{t-1}, bool [B].
+            hidden: [B, L].
+            cell: [B, L].
+            track: The parts of `Track`.
+        """
+        felt = proprio[:, None]
+        progress, after = self.odometry(felt, instruction[:, None], terminated[:, None], Track(*track))
         keep = (~terminated)[:, None].to(hidden.dtype)
-        features = self.encoder(torch.from_numpy(inputs.frame).to(device))
-        output = self(features[:, None], progress, proprio, hidden * keep, cell * keep)
-        probability = torch.sigmoid(output.logits[:, 0]).cpu().numpy()
-        return probability, TerminationMemory(output.hidden, output.cell, track)
+        output = self(self.encoder(frame)[:, None], progress, felt, hidden * keep, cell * keep)
+        return (torch.sigmoid(output.logits[:, 0]), output.hidden, output.cell, *after)
+
+    def train(self, mode: bool = True) -> Self:
+        """Set training mode, whose new weights the compiled tick would not have."""
+        if mode:
+            self.compiled = None
+        return super().train(mode)
 
 
 def true_phases(pose: Tensor, direction: Tensor, cell_size: float) -> Tensor:

@@ -27,8 +27,9 @@ def load(
     Raises:
         WeightsError: If the weights are missing, damaged, or of no known architecture, or their graph is damaged.
     """
-    from mujoban_planner.compiled import CompiledDecision
+    from mujoban_planner.compiled import DECISION, examples
     from mujoban_planner.networks import ARCHITECTURES
+    from mujoban_rl.compiled import load_graph
     from mujoban_rl.weights import WeightsError, load_weights, read_record
 
     weights = Path(path or SHIPPED)
@@ -39,10 +40,7 @@ def load(
     planner = load_weights(ARCHITECTURES[name], weights, device)
     planner.lay_out()
     if compiled and next(planner.parameters()).device.type == "cpu":
-        graph = CompiledDecision.beside(weights, record)
-        if graph is not None:
-            graph.check(planner.weigh)
-        planner.compiled = graph
+        planner.compiled = load_graph(weights, record, DECISION, planner.weigh, examples())
     return planner
 
 

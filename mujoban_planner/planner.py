@@ -19,7 +19,6 @@ from torch.nn import functional
 
 from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.interfaces import Memory, Planner, put_rows, take_rows
-from mujoban_planner.compiled import CompiledDecision
 from mujoban_planner.decision import (
     PushMeans,
     VisitCounts,
@@ -36,6 +35,7 @@ from mujoban_planner.decision import (
 )
 from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, Weighed, log_alive, verdicts
 from mujoban_planner.propagation import PLANES, propagate
+from mujoban_rl.compiled import CompiledGraph
 
 CAUTION = 4.0
 """Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/research)."""
@@ -73,7 +73,7 @@ class LearnedPlanner(nn.Module, Planner):
         """Weight of the verdicts on pushes and instructions in a decision; 1 is as trained."""
         self.doubt = DOUBT
         """Probability that a push is deadly from which on the planner looks from every side before it; 1 is never."""
-        self.compiled: CompiledDecision | None = None
+        self.compiled: CompiledGraph | None = None
         """`weigh` for a single robot as an exported graph, of the weights that were loaded."""
 
     @property

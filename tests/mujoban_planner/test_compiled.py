@@ -12,11 +12,11 @@ import mujoban_planner
 from mujoban_core.files import digest
 from mujoban_core.program import exit_status
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.compiled import graph_path
 from mujoban_planner.decision import count_visits, initial_means, initial_visits
 from mujoban_planner.export import export, main
 from mujoban_planner.networks import RecurrentPlanner
 from mujoban_planner.play import play
+from mujoban_rl.compiled import graph_path
 from mujoban_rl.weights import WeightsError, save_weights
 from mujoban_sokoban.generator import generate_batch
 

@@ -1,0 +1,89 @@
+"""Export a module's step for one robot as an ONNX graph beside its weights (`compiled`).
+
+Any other ONNX runtime can run it too: it holds the weights, and has a batch of one.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mujoban_core.files import digest, write_atomically
+from mujoban_rl.compiled import DIGEST, Signature, graph_path
+from mujoban_rl.weights import read_record, record_path
+
+
+class _Step(nn.Module):
+    """A function of a module as a module."""
+
+    def __init__(self, module: nn.Module, function: Callable[..., Sequence[Tensor]]) -> None:
+        super().__init__()
+        self.module, self._function = module, function
+
+    def forward(self, *inputs: Tensor) -> Sequence[Tensor]:
+        return self._function(*inputs)
+
+
+def export_graph(
+    weights: Path, module: nn.Module, function: Callable[..., Sequence[Tensor]], inputs: Sequence[Tensor],
+    signature: Signature,
+) -> Path:  # fmt: skip
+    """Write the graph of a function beside a weights file, with its digest in their record, and return where.
+
+    Args:
+        weights: File of the module's weights.
+        module: What was loaded from it.
+        function: Of the module, from the inputs to the outputs of the signature.
+        inputs: Tensors of the shapes that it takes.
+        signature: Names of both.
+
+    Raises:
+        ModuleNotFoundError: If `onnxscript` is not installed, which only exporting needs.
+    """
+    if find_spec("onnxscript") is None:
+        raise ModuleNotFoundError("exporting needs onnxscript, which is part of mujoban[dev]: pip install onnxscript")
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    program = torch.onnx.export(
+        _Step(module, function).eval(),
+        tuple(inputs),
+        dynamo=True,
+        input_names=signature.inputs,
+        output_names=signature.outputs,
+        verbose=False,
+    )
+    assert program is not None
+    model = program.model
+    _strip(model.graph.all_nodes())
+    _strip([model, model.graph, *model.graph.inputs, *model.graph.outputs, *model.graph.initializers.values()])
+    path = graph_path(weights)
+    write_atomically(path, program.model_proto.SerializeToString())
+    record = read_record(weights) | {DIGEST: digest(path)}
+    write_atomically(record_path(weights), (json.dumps(record, indent=2) + "\n").encode())
+    return path
+
+
+def _strip(parts: Iterable[Any]) -> None:
+    """Forget where in the source each part comes from, which names folders of this machine."""
+    for part in parts:
+        part.metadata_props.clear()
+        part.doc_string = None
+
+
+def tell(export: Callable[[Path], Path], weights: Path) -> None:
+    """Export, and say where the graph is.
+
+    Raises:
+        ValueError: If what exporting needs is not installed.
+    """
+    try:
+        path = export(weights)
+    except ModuleNotFoundError as error:
+        raise ValueError(str(error)) from error
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")

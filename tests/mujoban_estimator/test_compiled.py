@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+import torch
+
+import mujoban_estimator
+from mujoban_core.interfaces import TerminationInput
+from mujoban_estimator.export import export
+from mujoban_estimator.termination import ControlTermination
+from mujoban_rl.weights import save_weights
+
+
+def ticks(n, size, rng):
+    """Yield what a robot sees in n ticks."""
+    for tick in range(n):
+        yield TerminationInput(
+            frame=rng.integers(0, 256, (1, 64, 64, 3)).astype(np.uint8),
+            proprio=rng.normal(size=(1, size)).astype(np.float32),
+            instruction=np.array([tick // 4 % 5]),
+            terminated=np.array([tick % 4 == 0]),
+        )
+
+
+def leaves(memory):
+    hidden, cell, track = memory
+    return hidden, cell, *track
+
+
+@pytest.mark.parametrize("body", ["ball", "ant"])
+def test_beta_follows_from_the_graph_as_in_pytorch(tmp_path, body):
+    if body == "ball":
+        weights = mujoban_estimator.SHIPPED_TERMINATION
+    else:
+        torch.manual_seed(0)
+        small = ControlTermination(body=body, stem=8, channels=8, blocks=1, camera=8, hidden=8)
+        weights = tmp_path / "termination.safetensors"
+        save_weights(weights, small, small.hyperparameters(), {})
+        export(weights)
+    compiled = mujoban_estimator.load_termination(weights)
+    plain = mujoban_estimator.load_termination(weights, compiled=False)
+    assert compiled.compiled is not None and plain.compiled is None
+    a, b = compiled.initial_memory(1), plain.initial_memory(1)
+    size = plain.lstm.input_size - plain.config.camera - 24
+    for inputs in ticks(30, size, np.random.default_rng(0)):
+        (said, a), (expected, b) = compiled.probability(inputs, a), plain.probability(inputs, b)
+        assert said.shape == (1,) and np.allclose(said, expected, atol=1e-3)
+        pairs = list(zip(leaves(a), leaves(b), strict=True))
+        assert all(x.shape == y.shape and np.allclose(x, y, atol=1e-3) for x, y in pairs)
+
+
+def test_a_classifier_that_learns_on_leaves_the_graph_of_its_old_weights():
+    assert mujoban_estimator.load_termination().train().eval().compiled is None
