@@ -15,16 +15,28 @@ SHIPPED_TERMINATION = Path(__file__).parent / "weights" / "termination.safetenso
 """Weights of the control termination that ship with the package."""
 
 
-def load(path: str | Path | None = None, device: str = "cpu") -> StateEstimator:
+def load(path: str | Path | None = None, device: str = "cpu", *, compiled: bool = True) -> StateEstimator:
     """Return the learned state estimator with the given or the shipped weights.
 
-    Raises:
-        mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit.
-    """
-    from mujoban_estimator.estimator import StateEstimator
-    from mujoban_rl.weights import load_weights
+    Args:
+        path: A `.safetensors` file with its record beside; the shipped weights by default.
+        device: Where the network is put.
+        compiled: Whether to look for a graph of it, which only updates of single robots on a CPU need.
 
-    return load_weights(StateEstimator, path or SHIPPED, device)
+    Raises:
+        mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit, or their graph is damaged.
+    """
+    from mujoban_estimator.compiled import UPDATE, update_examples
+    from mujoban_estimator.estimator import StateEstimator
+    from mujoban_rl.compiled import load_graph
+    from mujoban_rl.weights import load_weights, read_record
+
+    file = Path(path or SHIPPED)
+    estimator = load_weights(StateEstimator, file, device)
+    if compiled and estimator.device.type == "cpu":
+        examples = update_examples(estimator)
+        estimator.compiled = load_graph(file, read_record(file), UPDATE, estimator.update, examples)
+    return estimator
 
 
 def load_termination(
@@ -40,7 +52,7 @@ def load_termination(
     Raises:
         mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit, or their graph is damaged.
     """
-    from mujoban_estimator.compiled import TICK, examples
+    from mujoban_estimator.compiled import TICK, tick_examples
     from mujoban_estimator.termination import ControlTermination
     from mujoban_rl.compiled import load_graph
     from mujoban_rl.weights import load_weights, read_record
@@ -48,5 +60,5 @@ def load_termination(
     file = Path(path or SHIPPED_TERMINATION)
     termination = load_weights(ControlTermination, file, device)
     if compiled and termination.device.type == "cpu":
-        termination.compiled = load_graph(file, read_record(file), TICK, termination.tick, examples(termination))
+        termination.compiled = load_graph(file, read_record(file), TICK, termination.tick, tick_examples(termination))
     return termination

@@ -1,4 +1,4 @@
-"""A tick of the control termination for one robot as a graph (`mujoban_rl.compiled`)."""
+"""What estimator and control termination do in a tick, for one robot, as graphs (`mujoban_rl.compiled`)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import Instruction
+from mujoban_estimator.estimator import StateEstimator
+from mujoban_estimator.geometry import cell_geometry
 from mujoban_estimator.odometry import Track
 from mujoban_estimator.termination import ControlTermination
 from mujoban_rl.compiled import Signature
@@ -26,7 +28,30 @@ TICK: Final = Signature(
 """`ControlTermination.tick`."""
 
 
-def examples(termination: ControlTermination) -> Iterator[list[NDArray[Any]]]:
+UPDATE: Final = Signature(
+    inputs=("frame", "relative", "pixels", "visible", "hidden", "cell"),
+    outputs=("estimate", "hidden_after", "cell_after"),
+    program="mujoban_estimator.export",
+    tolerance=0.01,
+)
+"""`StateEstimator.update`."""
+_EXAMPLES: Final = 3
+
+
+def update_examples(estimator: StateEstimator) -> Iterator[list[NDArray[Any]]]:
+    """Yield a few fixed inputs of an update, from different places."""
+    rng = np.random.default_rng(0)
+    body, belief = estimator.body, estimator.initial_belief(1)
+    for place in range(_EXAMPLES):
+        pose = np.array([[0.7 * place * body.cell_size, 0.4 * body.cell_size, 1.3 * place]])
+        yield [
+            rng.integers(0, 256, (1, FRAME_SIZE, FRAME_SIZE, 3)).astype(np.uint8),
+            *cell_geometry(pose, body.camera, body.cell_size),
+            *(part.cpu().numpy() for part in belief),
+        ]
+
+
+def tick_examples(termination: ControlTermination) -> Iterator[list[NDArray[Any]]]:
     """Yield a fixed input of a tick for each instruction."""
     rng = np.random.default_rng(0)
     hidden, cell, track = termination.initial_memory(1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from mujoban_core.interfaces import Estimator, EstimatorInput, Memory
 from mujoban_core.ranges import check_counts
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.geometry import ANCHORS, CELLS, FEATURES, cell_geometry
+from mujoban_rl.compiled import CompiledGraph
 
 BINARY: Final = (WALL, TARGET, BOX)
 """Layers with an independent classifier per cell; the agent's is one softmax over all cells."""
@@ -107,6 +108,8 @@ class GeometricAttention(nn.Module):
         # Shape [N, H * W, C]
         values = features.permute(0, 2, 3, 1).reshape(n, -1, channels)
         shown = visible.flatten(1)
+        if n == 1:  # to compute all costs less than to choose, and has one shape
+            return (_attend(logits, values) * shown[..., None].to(values.dtype)).reshape(1, CELLS, -1)
         counts = shown.sum(dim=1)
         # Most anchors are out of the frame. Frames are grouped by how many they show, which saves most of the work.
         order = torch.argsort(shown, dim=1, descending=True, stable=True)
@@ -183,6 +186,8 @@ class StateEstimator(nn.Module, Estimator):
             nn.Conv2d(c.belief + c.embedding, 64, 1), nn.ReLU(), nn.Conv2d(64, len(CHANNELS), 1)
         )
         self.classify_frame = nn.Conv2d(c.embedding, len(BINARY), 1)
+        self.compiled: CompiledGraph | None = None
+        """`update` for a single robot as an exported graph, of the weights that were loaded."""
         self._set_prior()
 
     def _set_prior(self) -> None:
@@ -216,9 +221,15 @@ class StateEstimator(nn.Module, Estimator):
             pose: (x [m], y [m], psi [rad]) in the map frame, [B, T, 3].
             belief: at the start of the sequences.
         """
-        b, t = features.shape[:2]
         geometry = cell_geometry(pose.reshape(-1, 3), self.body.camera, self.body.cell_size)
         relative, pixels, visible = (torch.from_numpy(g).to(features.device) for g in geometry)
+        return self._take_in(features, relative, pixels, visible, belief)
+
+    def _take_in(
+        self, features: Tensor, relative: Tensor, pixels: Tensor, visible: Tensor, belief: Belief
+    ) -> Estimates:
+        """Return what `forward` does, given where each cell is in each frame; see `cell_geometry`."""
+        b, t = features.shape[:2]
         looked = self.attention(features.flatten(0, 1), relative, pixels, visible)
         cells = self.embed(torch.cat([looked, visible.to(looked.dtype), relative.to(looked.dtype)], dim=-1))
         # Shape [N, D, 10, 10]
@@ -249,6 +260,13 @@ class StateEstimator(nn.Module, Estimator):
         rows = torch.nonzero(tick % self.config.update_every == 0)[:, 0]
         if len(rows) == 0:
             return held.numpy().copy(), (hidden, cell, tick + 1, held)
+        if self.compiled is not None and len(tick) == 1:
+            geometry = cell_geometry(inputs.pose, self.body.camera, self.body.cell_size)
+            frame = np.ascontiguousarray(inputs.frame)
+            held, hidden, cell = map(
+                torch.from_numpy, self.compiled([frame, *geometry, hidden.numpy(), cell.numpy()])
+            )
+            return held.numpy().copy(), (hidden, cell, tick + 1, held)
         index = rows.numpy()
         features = self.encoder(torch.from_numpy(inputs.frame[index]).to(self.device))
         chosen = rows.to(self.device)
@@ -257,6 +275,31 @@ class StateEstimator(nn.Module, Estimator):
         cell = cell.index_copy(0, chosen, output.belief.cell)
         held = held.index_copy(0, rows, probabilities(output.logits[:, 0]).cpu())
         return held.numpy().copy(), (hidden, cell, tick + 1, held)
+
+    def update(
+        self, frame: Tensor, relative: Tensor, pixels: Tensor, visible: Tensor, hidden: Tensor, cell: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the probability of each layer in each cell, [B, 10, 10, 4], and the two parts of the belief.
+
+        It is what `mujoban_estimator.export` exports, hence tensors alone.
+
+        Args:
+            frame: o_cam, uint8 [B, 64, 64, 3].
+            relative: Where the cells are, as `cell_geometry` says it.
+            pixels: Likewise.
+            visible: Likewise.
+            hidden: [B, L, 10, 10].
+            cell: [B, L, 10, 10].
+        """
+        seen = self.encoder(frame)[:, None]
+        output = self._take_in(seen, relative, pixels, visible, Belief(hidden, cell))
+        return probabilities(output.logits[:, 0]), output.belief.hidden, output.belief.cell
+
+    def train(self, mode: bool = True) -> Self:
+        """Set training mode, whose new weights the compiled update would not have."""
+        if mode:
+            self.compiled = None
+        return super().train(mode)
 
 
 def probabilities(logits: Tensor) -> Tensor:

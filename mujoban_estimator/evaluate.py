@@ -159,7 +159,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
     check_file("--json", options.json)
     set_threads(options.threads)
     result = evaluate(
-        load(options.estimator, options.device), load_termination(options.termination, options.device, compiled=False),
+        load(options.estimator, options.device, compiled=False),
+        load_termination(options.termination, options.device, compiled=False),
         find_bags(options.bags), max_ticks=options.max_ticks, skip_damaged=options.skip_damaged,
     )  # fmt: skip
     give_report({k: None if v != v else round(v, 5) for k, v in result.items()}, options.json)

@@ -1,6 +1,6 @@
-"""Export a tick of a control termination as an ONNX graph: `python -m mujoban_estimator.export [WEIGHTS]`.
+"""Export estimators and control terminations as ONNX graphs: `python -m mujoban_estimator.export [WEIGHTS ...]`.
 
-The graph lies beside the weights and makes the tick of one robot faster (`mujoban_rl.compiled`).
+The graphs lie beside the weights and make the tick of one robot faster (`mujoban_rl.compiled`).
 """
 
 from __future__ import annotations
@@ -19,36 +19,43 @@ import torch
 import tyro
 
 from mujoban_core.program import read_options, run_command
-from mujoban_estimator import SHIPPED_TERMINATION, load_termination
-from mujoban_estimator.compiled import TICK, examples
+from mujoban_estimator import SHIPPED, SHIPPED_TERMINATION, load, load_termination
+from mujoban_estimator.compiled import TICK, UPDATE, tick_examples, update_examples
+from mujoban_estimator.estimator import StateEstimator
 from mujoban_rl.export import export_graph, tell
+from mujoban_rl.weights import read_record
 
 PROG = TICK.program
 
 
 @dataclass(frozen=True)
 class Options:
-    """Which control termination to export."""
+    """Which estimators and control terminations to export."""
 
-    weights: Annotated[Path, tyro.conf.Positional] = SHIPPED_TERMINATION
-    """A `.safetensors` file with its record beside."""
+    weights: Annotated[tuple[Path, ...], tyro.conf.Positional] = (SHIPPED, SHIPPED_TERMINATION)
+    """`.safetensors` files with their records beside."""
 
 
 def export(weights: Path) -> Path:
     """Write the graph of a weights file beside it, and return where.
 
     Raises:
-        WeightsError: If the weights are missing, damaged or of no control termination.
+        WeightsError: If the weights are missing, damaged or of neither.
         ModuleNotFoundError: If `onnxscript` is not installed, which only exporting needs.
     """
-    termination = load_termination(weights, compiled=False)
-    inputs = [torch.from_numpy(x) for x in next(examples(termination))]
-    return export_graph(weights, termination, termination.tick, inputs, TICK)
+    if read_record(weights)["class"] == StateEstimator.__name__:
+        module = load(weights, compiled=False)
+        function, signature, inputs = module.update, UPDATE, next(update_examples(module))
+    else:
+        module = load_termination(weights, compiled=False)
+        function, signature, inputs = module.tick, TICK, next(tick_examples(module))
+    return export_graph(weights, module, function, [torch.from_numpy(x) for x in inputs], signature)
 
 
 def main(command_line: Sequence[str] | None = None) -> int:
     """Export, and say where the graph is."""
-    tell(export, read_options(Options, command_line, PROG, __doc__).weights)
+    for weights in read_options(Options, command_line, PROG, __doc__).weights:
+        tell(export, weights)
     return 0
 
 

@@ -91,7 +91,7 @@ class JointActor(Actor):
         controller = DrawingController(networks.controller, self._generator, own.explore)
         self._turns = turn > 0
         self._stack = SensePlanAct(
-            mujoban_estimator.load(start.estimator),
+            mujoban_estimator.load(start.estimator, compiled=False),
             mujoban_estimator.load_termination(start.termination, compiled=False),
             look_around(planner, turn), look_around(controller, turn),  # pyright: ignore[reportArgumentType]
         )  # fmt: skip

@@ -3,7 +3,8 @@ import pytest
 import torch
 
 import mujoban_estimator
-from mujoban_core.interfaces import TerminationInput
+from mujoban_core.interfaces import EstimatorInput, TerminationInput
+from mujoban_estimator.estimator import StateEstimator
 from mujoban_estimator.export import export
 from mujoban_estimator.termination import ControlTermination
 from mujoban_rl.weights import save_weights
@@ -45,6 +46,32 @@ def test_beta_follows_from_the_graph_as_in_pytorch(tmp_path, body):
         assert said.shape == (1,) and np.allclose(said, expected, atol=1e-3)
         pairs = list(zip(leaves(a), leaves(b), strict=True))
         assert all(x.shape == y.shape and np.allclose(x, y, atol=1e-3) for x, y in pairs)
+
+
+@pytest.mark.parametrize("body", ["ball", "ant"])
+def test_the_estimate_follows_from_the_graph_as_in_pytorch(tmp_path, body):
+    if body == "ball":
+        weights = mujoban_estimator.SHIPPED
+    else:
+        torch.manual_seed(0)
+        small = StateEstimator(body=body, stem=8, channels=8, blocks=1, belief=8, embedding=8)
+        weights = tmp_path / "estimator.safetensors"
+        save_weights(weights, small, small.hyperparameters(), {})
+        export(weights)
+    compiled, plain = mujoban_estimator.load(weights), mujoban_estimator.load(weights, compiled=False)
+    assert compiled.compiled is not None and plain.compiled is None
+    a, b = compiled.initial_memory(1), plain.initial_memory(1)
+    rng, cell = np.random.default_rng(0), plain.body.cell_size
+    for _ in range(12):
+        pose = np.array([[*rng.uniform(-3.0, 3.0, 2) * cell, rng.uniform(-3.0, 3.0)]])
+        inputs = EstimatorInput(rng.integers(0, 256, (1, 64, 64, 3)).astype(np.uint8), pose)
+        (said, a), (expected, b) = compiled.step(inputs, a), plain.step(inputs, b)
+        assert said.shape == (1, 10, 10, 4) and np.allclose(said, expected, atol=1e-3)
+        assert all(np.allclose(x, y, atol=1e-3) for x, y in zip(a, b, strict=True))
+
+
+def test_what_learns_on_leaves_the_graph_of_its_old_weights():
+    assert mujoban_estimator.load().train().eval().compiled is None
 
 
 def test_a_classifier_that_learns_on_leaves_the_graph_of_its_old_weights():
