@@ -29,7 +29,7 @@ def load(path: str | Path | None = None, device: str = "cpu", *, compiled: bool 
     Raises:
         mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit, or their graph is damaged.
     """
-    from mujoban_controller.compiled import TICK, examples
+    from mujoban_controller.compiled import STEP, examples
     from mujoban_controller.controller import VisuomotorController
     from mujoban_controller.privileged import PrivilegedPolicy
     from mujoban_rl.compiled import load_graph
@@ -42,5 +42,5 @@ def load(path: str | Path | None = None, device: str = "cpu", *, compiled: bool 
         return PrivilegedController(load_weights(PrivilegedPolicy, file, device))
     controller = load_weights(VisuomotorController, file, device)
     if compiled and controller.device.type == "cpu":
-        controller.compiled = load_graph(file, read_record(file), TICK, controller.tick, examples(controller))
+        controller.compiled = load_graph(file, read_record(file), STEP, controller.tick, examples(controller))
     return controller

@@ -17,7 +17,7 @@ Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -35,8 +35,9 @@ from mujoban_core.grid import CONTROL_PERIOD, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
 from mujoban_rl.compiled import CompiledGraph
 from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder, gaussian, gaussian_layers, rows_of_sky
+from mujoban_rl.ticks import TICK, tick_arrays
 
-INPUT_FIELDS = ("frame", "proprio", "instruction", "terminated")
+INPUT_FIELDS = TICK
 """What the controller sees, as recorded windows name it."""
 MEMORY_FIELDS = ("memory0", "memory1", "memory2")
 """Its memory before a tick, `Recurrent`."""
@@ -324,7 +325,7 @@ class VisuomotorController(GoalPolicy, Controller):
     @torch.inference_mode()
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return the mean torque limited to [-1, 1], [B, U], and the next memory."""
-        arrays = _arrays(inputs)
+        arrays = tick_arrays(inputs)
         if self.compiled is not None and len(inputs.frame) == 1:
             torque, *memory = self.compiled([*arrays, *(part.numpy() for part in state)])
             return torque, Recurrent(*map(torch.from_numpy, memory))
@@ -352,16 +353,7 @@ class VisuomotorController(GoalPolicy, Controller):
 
     def to_tensors(self, inputs: ControllerInput) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return one tick's observations, [B, ...], as sequences of one tick, [B, 1, ...], on the module's device."""
-        tensors = (torch.from_numpy(a).to(self.device).unsqueeze(1) for a in _arrays(inputs))
+        tensors = (torch.from_numpy(a).to(self.device).unsqueeze(1) for a in tick_arrays(inputs))
         frame, proprio, instruction, terminated = tensors
         return frame, proprio, instruction, terminated
 
-
-def _arrays(inputs: ControllerInput) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return one tick's observations, [B, ...], as arrays that tensors can be made of."""
-    return (
-        np.ascontiguousarray(inputs.frame),
-        np.asarray(inputs.proprio, np.float32),
-        np.asarray(inputs.instruction, np.int64),
-        np.asarray(inputs.terminated, np.bool_),
-    )

@@ -19,13 +19,13 @@ import torch
 import tyro
 
 from mujoban_controller import SHIPPED
-from mujoban_controller.compiled import TICK, examples
+from mujoban_controller.compiled import STEP, examples
 from mujoban_controller.controller import VisuomotorController
 from mujoban_core.program import read_options, run_command
 from mujoban_rl.export import export_graph, tell
 from mujoban_rl.weights import load_weights
 
-PROG = TICK.program
+PROG = STEP.program
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def export(weights: Path) -> Path:
     """
     controller = load_weights(VisuomotorController, weights)
     inputs = [torch.from_numpy(x) for x in next(examples(controller))]
-    return export_graph(weights, controller, controller.tick, inputs, TICK)
+    return export_graph(weights, controller, controller.tick, inputs, STEP)
 
 
 def main(command_line: Sequence[str] | None = None) -> int:

@@ -20,12 +20,12 @@ import tyro
 
 from mujoban_core.program import read_options, run_command
 from mujoban_estimator import SHIPPED, SHIPPED_TERMINATION, load, load_termination
-from mujoban_estimator.compiled import TICK, UPDATE, tick_examples, update_examples
+from mujoban_estimator.compiled import STEP, UPDATE, step_examples, update_examples
 from mujoban_estimator.estimator import StateEstimator
 from mujoban_rl.export import export_graph, tell
 from mujoban_rl.weights import read_record
 
-PROG = TICK.program
+PROG = STEP.program
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def export(weights: Path) -> Path:
         function, signature, inputs = module.update, UPDATE, next(update_examples(module))
     else:
         module = load_termination(weights, compiled=False)
-        function, signature, inputs = module.tick, TICK, next(tick_examples(module))
+        function, signature, inputs = module.tick, STEP, next(step_examples(module))
     return export_graph(weights, module, function, [torch.from_numpy(x) for x in inputs], signature)
 
 

@@ -22,6 +22,7 @@ from mujoban_core.ranges import check_counts
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.odometry import FEATURES, Odometry, Track, turn
 from mujoban_rl.compiled import CompiledGraph
+from mujoban_rl.ticks import tick_arrays
 
 PHASES: Final = 4
 """Cosine and sine of the robot's place within its cell, along and across the instruction."""
@@ -150,10 +151,7 @@ class ControlTermination(nn.Module, Termination):
         if not np.isfinite(inputs.proprio).all():
             raise ValueError(f"proprioception {inputs.proprio.tolist()}: expected finite numbers")
         hidden, cell, track = memory
-        arrays = (
-            np.ascontiguousarray(inputs.frame), np.asarray(inputs.proprio, np.float32),
-            np.asarray(inputs.instruction, np.int64), np.asarray(inputs.terminated, np.bool_),
-        )  # fmt: skip
+        arrays = tick_arrays(inputs)
         if self.compiled is not None and len(inputs.frame) == 1:
             probability, *after = self.compiled([*arrays, *(part.numpy() for part in (hidden, cell, *track))])
             hidden, cell, *parts = map(torch.from_numpy, after)
