@@ -14,7 +14,6 @@ from mujoban_rl.ticks import TICK, tick_examples
 STEP: Final = Signature(
     inputs=(*TICK, "output", "cell", "track"),
     outputs=("torque", "output_after", "cell_after", "track_after"),
-    program="mujoban_controller.export",
     tolerance=0.01,
 )
 """`VisuomotorController.tick`."""

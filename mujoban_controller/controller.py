@@ -338,7 +338,7 @@ class VisuomotorController(GoalPolicy, Controller):
     ) -> tuple[Tensor, ...]:  # fmt: skip
         """Return the mean torque limited to [-1, 1], [B, U], and the three parts of the next memory.
 
-        It is what `mujoban_controller.export` exports, hence tensors alone: those of `forward` in one tick, [B, ...],
+        It is what `export.export` exports, hence tensors alone: those of `forward` in one tick, [B, ...],
         and the parts of `Recurrent`.
         """
         sequences = (x.unsqueeze(1) for x in (frame, proprio, instruction, terminated))

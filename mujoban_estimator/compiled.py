@@ -22,7 +22,6 @@ _MEMORY: Final = ("hidden", "cell", *Track._fields)
 STEP: Final = Signature(
     inputs=(*TICK, *_MEMORY),
     outputs=("probability", *(f"{name}_after" for name in _MEMORY)),
-    program="mujoban_estimator.export",
     tolerance=0.01,
 )
 """`ControlTermination.tick`."""
@@ -31,7 +30,6 @@ STEP: Final = Signature(
 UPDATE: Final = Signature(
     inputs=("frame", "relative", "pixels", "visible", "hidden", "cell"),
     outputs=("estimate", "hidden_after", "cell_after"),
-    program="mujoban_estimator.export",
     tolerance=0.01,
 )
 """`StateEstimator.update`."""

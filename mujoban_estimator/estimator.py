@@ -281,7 +281,7 @@ class StateEstimator(nn.Module, Estimator):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the probability of each layer in each cell, [B, 10, 10, 4], and the two parts of the belief.
 
-        It is what `mujoban_estimator.export` exports, hence tensors alone.
+        It is what `export` exports, hence tensors alone.
 
         Args:
             frame: o_cam, uint8 [B, 64, 64, 3].

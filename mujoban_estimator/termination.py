@@ -167,7 +167,7 @@ class ControlTermination(nn.Module, Termination):
     ) -> tuple[Tensor, ...]:  # fmt: skip
         """Return p(A_{t-1} is completed), [B], and the parts of the next memory.
 
-        It is what `mujoban_estimator.export` exports, hence tensors alone.
+        It is what `export` exports, hence tensors alone.
 
         Args:
             frame: o_cam, uint8 [B, 64, 64, 3].

@@ -15,7 +15,6 @@ from mujoban_rl.compiled import Signature
 DECISION: Final = Signature(
     inputs=("states", "seen", "push", "push_alive", "penalty", "caution"),
     outputs=("score", "push_after", "push_alive_after"),
-    program="mujoban_planner.export",
     tolerance=0.05,
 )
 """`LearnedPlanner.weigh`."""

@@ -198,7 +198,7 @@ class LearnedPlanner(nn.Module, Planner):
     ) -> Weighed:
         """Return the scores of the instructions, but for what was tried, and means: one forward pass.
 
-        It is what `mujoban_planner.export` exports, hence tensors alone.
+        It is what `export` exports, hence tensors alone.
 
         Args:
             states: [B, N, N, 4].

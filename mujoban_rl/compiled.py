@@ -24,6 +24,9 @@ from mujoban_rl.weights import WEIGHTS_LIMIT, WeightsError, read_bounded
 DIGEST: Final = "graph"
 """Key of the weights' record: SHA-256 of the graph's file."""
 
+PROGRAM: Final = "bringup.export"
+"""Module that writes graphs, by `python -m`."""
+
 Arrays = Sequence[NDArray[Any]]
 
 
@@ -34,8 +37,6 @@ class Signature(NamedTuple):
     """Names of the function's arguments, in their order."""
     outputs: tuple[str, ...]
     """Names of what it returns, none of them that of an input."""
-    program: str
-    """Module that writes such graphs, by `python -m`."""
     tolerance: float
     """Difference of a value that the order of additions may make."""
 
@@ -73,7 +74,7 @@ class CompiledGraph:
         if DIGEST not in record:
             warnings.warn(
                 f"{path}: a graph of other weights than {weights.name}, hence not used; a step is slower until "
-                f"`python -m {signature.program} {weights}` writes a new one",
+                f"`python -m {PROGRAM} {weights}` writes a new one",
                 stacklevel=2,
             )
             return None
@@ -95,9 +96,7 @@ class CompiledGraph:
                 expected = [x.numpy() for x in function(*map(torch.from_numpy, arrays))]
             for name, said, wanted in zip(signature.outputs, self(arrays), expected, strict=True):
                 if not np.allclose(said, wanted, atol=signature.tolerance, rtol=1e-3):
-                    raise WeightsError(
-                        f"{self.path}: its {name} is not that of the weights; {_again(self.path, signature)}"
-                    )
+                    raise WeightsError(f"{self.path}: its {name} is not that of the weights; {_again(self.path)}")
 
     def __call__(self, inputs: Arrays) -> list[NDArray[Any]]:
         """Return the outputs of inputs, arrays as the function takes them, with a batch of one."""
@@ -128,8 +127,8 @@ def graph_path(weights: Path) -> Path:
     return weights.with_suffix(".onnx")
 
 
-def _again(path: Path, signature: Signature) -> str:
-    return f"`python -m {signature.program} {path.with_suffix('.safetensors')}` writes a new one"
+def _again(path: Path) -> str:
+    return f"`python -m {PROGRAM} {path.with_suffix('.safetensors')}` writes a new one"
 
 
 def _start(path: Path, digest: str, signature: Signature) -> Any:
@@ -137,7 +136,7 @@ def _start(path: Path, digest: str, signature: Signature) -> Any:
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     import onnxruntime
 
-    again = _again(path, signature)
+    again = _again(path)
     data = read_bounded(path, WEIGHTS_LIMIT)
     if (found := hashlib.sha256(data).hexdigest()) != digest:
         raise WeightsError(f"{path}: damaged or not the graph of its record: SHA-256 is {found}, not {digest}; {again}")

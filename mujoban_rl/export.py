@@ -45,6 +45,7 @@ def export_graph(
         signature: Names of both.
 
     Raises:
+        WeightsError: If the weights' record is missing or damaged.
         ModuleNotFoundError: If `onnxscript` is not installed, which only exporting needs.
     """
     if find_spec("onnxscript") is None:
@@ -75,15 +76,3 @@ def _strip(parts: Iterable[Any]) -> None:
         part.metadata_props.clear()
         part.doc_string = None
 
-
-def tell(export: Callable[[Path], Path], weights: Path) -> None:
-    """Export, and say where the graph is.
-
-    Raises:
-        ValueError: If what exporting needs is not installed.
-    """
-    try:
-        path = export(weights)
-    except ModuleNotFoundError as error:
-        raise ValueError(str(error)) from error
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")

@@ -65,9 +65,9 @@ def test_a_graph_of_other_weights_is_refused_or_not_used(exported):
     with torch.no_grad():
         policy.mean.weight.normal_()
     save_weights(exported, policy, policy.config, {})
-    with pytest.warns(UserWarning, match=r"controller\.onnx: a graph of other weights .*mujoban_controller\.export"):
+    with pytest.warns(UserWarning, match=r"controller\.onnx: a graph of other weights .*bringup\.export"):
         assert mujoban_controller.load(exported).compiled is None
     graph_path(exported).write_bytes(b"no graph")
     save_weights(exported, policy, policy.config, {"graph": "0" * 64})
-    with pytest.raises(WeightsError, match=r"controller\.onnx: damaged .*mujoban_controller\.export"):
+    with pytest.raises(WeightsError, match=r"controller\.onnx: damaged .*bringup\.export"):
         mujoban_controller.load(exported)

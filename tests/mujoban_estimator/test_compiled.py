@@ -5,7 +5,7 @@ import torch
 import mujoban_estimator
 from mujoban_core.interfaces import EstimatorInput, TerminationInput
 from mujoban_estimator.estimator import StateEstimator
-from mujoban_estimator.export import export
+from mujoban_estimator.export import export_estimator, export_termination
 from mujoban_estimator.termination import ControlTermination
 from mujoban_rl.weights import save_weights
 
@@ -35,7 +35,7 @@ def test_beta_follows_from_the_graph_as_in_pytorch(tmp_path, body):
         small = ControlTermination(body=body, stem=8, channels=8, blocks=1, camera=8, hidden=8)
         weights = tmp_path / "termination.safetensors"
         save_weights(weights, small, small.hyperparameters(), {})
-        export(weights)
+        export_termination(weights)
     compiled = mujoban_estimator.load_termination(weights)
     plain = mujoban_estimator.load_termination(weights, compiled=False)
     assert compiled.compiled is not None and plain.compiled is None
@@ -57,7 +57,7 @@ def test_the_estimate_follows_from_the_graph_as_in_pytorch(tmp_path, body):
         small = StateEstimator(body=body, stem=8, channels=8, blocks=1, belief=8, embedding=8)
         weights = tmp_path / "estimator.safetensors"
         save_weights(weights, small, small.hyperparameters(), {})
-        export(weights)
+        export_estimator(weights)
     compiled, plain = mujoban_estimator.load(weights), mujoban_estimator.load(weights, compiled=False)
     assert compiled.compiled is not None and plain.compiled is None
     a, b = compiled.initial_memory(1), plain.initial_memory(1)
