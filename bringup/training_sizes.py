@@ -63,7 +63,7 @@ class Machine:
         return max(1, self.cores // (2 if stage in _HALF else 4)) if self.gpu else 1
 
     def budget(self, stage: str, seconds: float) -> tuple[str, ...]:
-        """Return the options by which a training ends after its share of the time, by the clock."""
+        """Return the options by which a training ends after so many seconds: of the clock, or of each of its cores."""
         if self.gpu:
             return ("--device", self.device, "--cpu-seconds", _NEVER, "--horizon-seconds", str(round(seconds)))
         return ("--cpu-seconds", str(round(seconds * self.cores_of(stage))))

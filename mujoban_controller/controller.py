@@ -17,7 +17,7 @@ Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CONTROL_PERIOD, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
-from mujoban_rl.compiled import CompiledGraph
+from mujoban_rl.compiled import Compilable
 from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder, gaussian, gaussian_layers, rows_of_sky
 from mujoban_rl.ticks import TICK, tick_arrays
 
@@ -103,7 +103,7 @@ class ControllerOutput(NamedTuple):
     """Memory after the last tick."""
 
 
-class VisuomotorController(GoalPolicy, Controller):
+class VisuomotorController(Compilable, GoalPolicy, Controller):
     """The learned controller of paper C.3; sees o_cam, o_pr, A and beta and nothing else.
 
     As a `Controller` it is deterministic: the mean torque, limited to [-1, 1].
@@ -138,8 +138,6 @@ class VisuomotorController(GoalPolicy, Controller):
         self.body = body
         self.mixed_precision = False
         """Whether the ResNet may compute in bfloat16: in training, not on the robot, so that runs repeat exactly."""
-        self.compiled: CompiledGraph | None = None
-        """`tick` for a single robot as an exported graph, of the weights that were loaded."""
         self.joints = len(layout.joints)
         self.proprio_size, self.action_size, self.hidden = layout.proprio_size, layout.action_size, hidden
         self.heading_index = layout.heading_index
@@ -344,12 +342,6 @@ class VisuomotorController(GoalPolicy, Controller):
         sequences = (x.unsqueeze(1) for x in (frame, proprio, instruction, terminated))
         result = self.forward(*sequences, memory=Recurrent(output, cell, track))
         return (result.action.mean[:, 0].clamp(-1.0, 1.0), *result.memory)
-
-    def train(self, mode: bool = True) -> Self:
-        """Set training mode, whose new weights the compiled tick would not have."""
-        if mode:
-            self.compiled = None
-        return super().train(mode)
 
     def to_tensors(self, inputs: ControllerInput) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return one tick's observations, [B, ...], as sequences of one tick, [B, 1, ...], on the module's device."""

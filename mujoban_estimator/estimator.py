@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from mujoban_core.interfaces import Estimator, EstimatorInput, Memory
 from mujoban_core.ranges import check_counts
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.geometry import ANCHORS, CELLS, FEATURES, cell_geometry
-from mujoban_rl.compiled import CompiledGraph
+from mujoban_rl.compiled import Compilable
 
 BINARY: Final = (WALL, TARGET, BOX)
 """Layers with an independent classifier per cell; the agent's is one softmax over all cells."""
@@ -162,7 +162,7 @@ class ConvLSTM(nn.Module):
         return torch.stack(steps, dim=1), Belief(hidden, cell)
 
 
-class StateEstimator(nn.Module, Estimator):
+class StateEstimator(Compilable, Estimator):
     """Recurrent classifier (o_cam, o_pos) -> s_abst.
 
     Memory: belief (two [B, L, 10, 10]), ticks since the episode's start [B], and the estimate held [B, 10, 10, 4].
@@ -186,8 +186,6 @@ class StateEstimator(nn.Module, Estimator):
             nn.Conv2d(c.belief + c.embedding, 64, 1), nn.ReLU(), nn.Conv2d(64, len(CHANNELS), 1)
         )
         self.classify_frame = nn.Conv2d(c.embedding, len(BINARY), 1)
-        self.compiled: CompiledGraph | None = None
-        """`update` for a single robot as an exported graph, of the weights that were loaded."""
         self._set_prior()
 
     def _set_prior(self) -> None:
@@ -294,12 +292,6 @@ class StateEstimator(nn.Module, Estimator):
         seen = self.encoder(frame)[:, None]
         output = self._take_in(seen, relative, pixels, visible, Belief(hidden, cell))
         return probabilities(output.logits[:, 0]), output.belief.hidden, output.belief.cell
-
-    def train(self, mode: bool = True) -> Self:
-        """Set training mode, whose new weights the compiled update would not have."""
-        if mode:
-            self.compiled = None
-        return super().train(mode)
 
 
 def probabilities(logits: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from mujoban_core.interfaces import Memory, Termination, TerminationInput
 from mujoban_core.ranges import check_counts
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.odometry import FEATURES, Odometry, Track, turn
-from mujoban_rl.compiled import CompiledGraph
+from mujoban_rl.compiled import Compilable
 from mujoban_rl.ticks import tick_arrays
 
 PHASES: Final = 4
@@ -73,7 +73,7 @@ class Verdicts(NamedTuple):
     cell: Tensor
 
 
-class ControlTermination(nn.Module, Termination):
+class ControlTermination(Compilable, Termination):
     """Sequential binary classifier (o_cam, o_pr, A_{t-1}, beta_{t-1}) -> p_t(beta)."""
 
     def __init__(self, encoder: FrameEncoder | None = None, **config: str | int | float | bool) -> None:
@@ -95,8 +95,6 @@ class ControlTermination(nn.Module, Termination):
         self.phases = nn.Linear(c.camera, PHASES)
         self.lstm = nn.LSTM(c.camera + FEATURES + body.proprio_size, c.hidden, batch_first=True)
         self.verdict = nn.Sequential(nn.Linear(c.hidden, c.hidden), nn.ReLU(), nn.Linear(c.hidden, 1))
-        self.compiled: CompiledGraph | None = None
-        """`tick` for a single robot as an exported graph, of the weights that were loaded."""
         nn.init.constant_(self.verdict[-1].bias, _PRIOR_LOGIT)  # pyright: ignore[reportArgumentType]
 
     @property
@@ -183,12 +181,6 @@ class ControlTermination(nn.Module, Termination):
         keep = (~terminated)[:, None].to(hidden.dtype)
         output = self(self.encoder(frame)[:, None], progress, felt, hidden * keep, cell * keep)
         return (torch.sigmoid(output.logits[:, 0]), output.hidden, output.cell, *after)
-
-    def train(self, mode: bool = True) -> Self:
-        """Set training mode, whose new weights the compiled tick would not have."""
-        if mode:
-            self.compiled = None
-        return super().train(mode)
 
 
 def true_phases(pose: Tensor, direction: Tensor, cell_size: float) -> Tensor:

@@ -9,7 +9,7 @@ interior alone), C channels, A = 5 instructions, D = 4 directions.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ from mujoban_planner.decision import (
 )
 from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, Weighed, log_alive, verdicts
 from mujoban_planner.propagation import PLANES, propagate
-from mujoban_rl.compiled import CompiledGraph
+from mujoban_rl.compiled import Compilable
 
 CAUTION = 4.0
 """Weight of the verdicts in a decision by default: what solved most, of 1, 2, 4 and 8 (docs/research)."""
@@ -43,7 +43,7 @@ DOUBT = 0.02
 """Probability that a push is deadly from which on a planner looks from every side before it, by default."""
 
 
-class LearnedPlanner(nn.Module, Planner):
+class LearnedPlanner(Compilable, Planner):
     """A planner network with its decision rule.
 
     The decision is greedy over log pi(A | s) + caution * log(1 - p(dead | s, A)), one forward pass, less a penalty for
@@ -73,8 +73,6 @@ class LearnedPlanner(nn.Module, Planner):
         """Weight of the verdicts on pushes and instructions in a decision; 1 is as trained."""
         self.doubt = DOUBT
         """Probability that a push is deadly from which on the planner looks from every side before it; 1 is never."""
-        self.compiled: CompiledGraph | None = None
-        """`weigh` for a single robot as an exported graph, of the weights that were loaded."""
 
     @property
     def device(self) -> torch.device:
@@ -122,12 +120,6 @@ class LearnedPlanner(nn.Module, Planner):
     def inputs(self) -> int:
         """Number of input planes."""
         return len(CHANNELS) + (PLANES if self.propagation else 0)
-
-    def train(self, mode: bool = True) -> Self:
-        """Set training mode, whose new weights the compiled decision would not have."""
-        if mode:
-            self.compiled = None
-        return super().train(mode)
 
     def lay_out(self) -> None:
         """Store convolutions' weights channels-last, as they would rearrange them in every call."""

@@ -13,11 +13,12 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from mujoban_rl.weights import WEIGHTS_LIMIT, WeightsError, read_bounded
 
@@ -105,6 +106,19 @@ class CompiledGraph:
     def __reduce__(self) -> tuple[type[CompiledGraph], tuple[Path, str, Signature]]:
         """Compile again where it is copied or sent to another process, as a session can be neither."""
         return type(self), (self.path, self.digest, self.signature)
+
+
+class Compilable(nn.Module):
+    """A module that may have a graph of its step for one robot."""
+
+    compiled: CompiledGraph | None = None
+    """Of the weights that were loaded."""
+
+    def train(self, mode: bool = True) -> Self:
+        """Set training mode, whose new weights the graph would not have."""
+        if mode:
+            self.compiled = None
+        return super().train(mode)
 
 
 def load_graph(
