@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_planner.boards import BitBoards, state_tensor
-from mujoban_planner.heads import PlannerOutput
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.push_env import possible_masks
 from mujoban_planner.reinforcement import silence_verdicts
@@ -102,6 +101,7 @@ class Anchor:
     def loss(self, planner: LearnedPlanner, boards: BitBoards, symmetry: NDArray[np.int64] | None = None) -> Tensor:
         """Return how far the planner's policy, plan map, verdicts and Q have come from those of the beginning.
 
+        The policy is that before the way to a push counts, since the pushes that are wanted are to change.
         Cross-entropies less what they are at least, and the smooth L1 distance of Q: 0 where nothing has changed.
 
         Args:
@@ -113,8 +113,8 @@ class Anchor:
         boards = BitBoards._make(column[:n] for column in boards)
         symmetry = None if symmetry is None else symmetry[:n]
         state = state_tensor(boards, symmetry)
-        before: PlannerOutput = self._before(state)
-        now: PlannerOutput = planner(state)
+        before, _ = self._before.read(state)
+        now, _ = planner.read(state)
         loss = functional.smooth_l1_loss(now.q, before.q)
         for new, old in ((now.policy, before.policy), (now.plan, before.plan)):
             spread = functional.kl_div(new.log_softmax(1), old.log_softmax(1), reduction="none", log_target=True)
