@@ -7,25 +7,30 @@ With a `make` that opens or resumes the run in a directory::
 
     check_resuming(make, tmp_path, stop_at=3, updates=6)
     check_refusal(make(tmp_path / "nan"), lambda batch: batch * math.nan)
+
+And ticks to step modules through.
 """
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from mujoban_core.interfaces import ControllerInput, TerminationInput
 from mujoban_core.signals import Interrupted
 from mujoban_rl.engine import CARRIED, Learner, Source, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.run_directory import copy_light
 
 BatchT = TypeVar("BatchT")
+SeenT = TypeVar("SeenT", ControllerInput, TerminationInput)
 
 
 def tensors_of(part: Learner[Any] | Source[Any]) -> dict[str, Tensor]:
@@ -122,3 +127,14 @@ def check_refusal(trainer: Trainer[BatchT], poison: Callable[[BatchT], BatchT]) 
     learner.update(third, 0.5, guard)
     assert not guard.skipped, "what the refused batch left behind spoils the next"
     assert differing(before, tensors_of(learner)), "nothing was learned from the next batch"
+
+
+def robot_ticks(kind: type[SeenT], n: int, proprio_size: int, rng: np.random.Generator) -> Iterator[SeenT]:
+    """Yield what a robot might see in n ticks, a new instruction every third."""
+    for tick in range(n):
+        yield kind(
+            frame=rng.integers(0, 256, (1, 64, 64, 3)).astype(np.uint8),
+            proprio=rng.normal(size=(1, proprio_size)).astype(np.float32),
+            instruction=np.array([tick // 3 % 5]),
+            terminated=np.array([tick % 3 == 0]),
+        )

@@ -9,18 +9,8 @@ from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.export import export
 from mujoban_core.interfaces import ControllerInput
 from mujoban_rl.compiled import graph_path
+from mujoban_rl.testing import robot_ticks
 from mujoban_rl.weights import WeightsError, save_weights
-
-
-def ticks(n, size, rng):
-    """Yield what a robot sees in n ticks."""
-    for tick in range(n):
-        yield ControllerInput(
-            frame=rng.integers(0, 256, (1, 64, 64, 3)).astype(np.uint8),
-            proprio=rng.normal(size=(1, size)).astype(np.float32),
-            instruction=np.array([tick // 3 % 5]),
-            terminated=np.array([tick % 3 == 0]),
-        )
 
 
 @pytest.fixture
@@ -39,7 +29,7 @@ def test_the_policy_that_ships_drives_by_its_graph_as_in_pytorch():
     plain = mujoban_controller.load(compiled=False)
     assert compiled.compiled is not None and plain.compiled is None
     a, b = compiled.initial_memory(1), plain.initial_memory(1)
-    for inputs in ticks(30, plain.proprio_size, np.random.default_rng(0)):
+    for inputs in robot_ticks(ControllerInput, 30, plain.proprio_size, np.random.default_rng(0)):
         (torque, a), (expected, b) = compiled.step(inputs, a), plain.step(inputs, b)
         assert np.allclose(torque, expected, atol=1e-3)
         assert all(np.allclose(x, y, atol=1e-3) for x, y in zip(a, b, strict=True))
@@ -49,7 +39,7 @@ def test_a_body_that_does_not_feel_its_heading_has_a_graph_too(exported):
     compiled, plain = mujoban_controller.load(exported), mujoban_controller.load(exported, compiled=False)
     assert compiled.compiled is not None
     a, b = compiled.initial_memory(1), plain.initial_memory(1)
-    for inputs in ticks(10, plain.proprio_size, np.random.default_rng(1)):
+    for inputs in robot_ticks(ControllerInput, 10, plain.proprio_size, np.random.default_rng(1)):
         (torque, a), (expected, b) = compiled.step(inputs, a), plain.step(inputs, b)
         assert np.allclose(torque, expected, atol=1e-3)
 

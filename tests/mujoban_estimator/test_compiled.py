@@ -7,18 +7,8 @@ from mujoban_core.interfaces import EstimatorInput, TerminationInput
 from mujoban_estimator.estimator import StateEstimator
 from mujoban_estimator.export import export_estimator, export_termination
 from mujoban_estimator.termination import ControlTermination
+from mujoban_rl.testing import robot_ticks
 from mujoban_rl.weights import save_weights
-
-
-def ticks(n, size, rng):
-    """Yield what a robot sees in n ticks."""
-    for tick in range(n):
-        yield TerminationInput(
-            frame=rng.integers(0, 256, (1, 64, 64, 3)).astype(np.uint8),
-            proprio=rng.normal(size=(1, size)).astype(np.float32),
-            instruction=np.array([tick // 4 % 5]),
-            terminated=np.array([tick % 4 == 0]),
-        )
 
 
 def leaves(memory):
@@ -41,7 +31,7 @@ def test_beta_follows_from_the_graph_as_in_pytorch(tmp_path, body):
     assert compiled.compiled is not None and plain.compiled is None
     a, b = compiled.initial_memory(1), plain.initial_memory(1)
     size = plain.lstm.input_size - plain.config.camera - 24
-    for inputs in ticks(30, size, np.random.default_rng(0)):
+    for inputs in robot_ticks(TerminationInput, 30, size, np.random.default_rng(0)):
         (said, a), (expected, b) = compiled.probability(inputs, a), plain.probability(inputs, b)
         assert said.shape == (1,) and np.allclose(said, expected, atol=1e-3)
         pairs = list(zip(leaves(a), leaves(b), strict=True))
