@@ -42,7 +42,7 @@ class Options:
     look_ahead: int = 400
     """Evaluations of that search."""
 
-    def stack(self, look_ahead: int = 0) -> Stack:
+    def stack(self, look_ahead: int | None = None) -> Stack:
         """Return the stack to measure."""
         choices = {role: Choice(role, "oracle" if role in self.oracle else "learned") for role in ROLES}
         return Stack(choices, deliberation=Deliberation(look_ahead=look_ahead))

@@ -45,8 +45,9 @@ class Run:
         self._reader.start()
 
     def _prepare(self) -> None:
-        """In the child: take the terminal, and hear hang-ups, which nohup has all that it starts ignore."""
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        """In the child: take the terminal, and hear hang-ups and Ctrl-C, which nohup and `&` have it ignore."""
+        for number in (signal.SIGHUP, signal.SIGINT):
+            signal.signal(number, signal.SIG_DFL)
         if self.terminal:
             fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 

@@ -118,7 +118,7 @@ class Stack:
         modules = {role: choice.load(self.device) for role, choice in self.choices.items()}
         for role, module in modules.items():
             check_body(role, module, self.body)
-        modules["planner"] = self.deliberation.prepare(modules["planner"])
+        modules["planner"] = self.deliberation.prepare(modules["planner"], self.choices["planner"].source)
         ticks = self.look_around_ticks
         scout = load_scout(self.scout.source, self.scout.weights, self.device) if ticks else None
         body = get_body(self.body)
@@ -132,7 +132,8 @@ class Stack:
 
     def settings(self) -> dict[str, int | float]:
         """Return what a report says, beside `identities`, of how the modules play."""
-        return {"look_around": self.look_around_ticks, **self.deliberation.settings()}
+        thinking = self.deliberation.settings(self.choices["planner"].source)
+        return {"look_around": self.look_around_ticks, **thinking}
 
 
 @dataclass(frozen=True)

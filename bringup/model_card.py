@@ -76,7 +76,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "of 8 x 8 inner cells; more than four boxes were not trained on.",
         "what was tried loses attraction; verdicts on pushes are weighed by a constant, and before a push called "
         "deadly it looks at the board from every side; a fixed recursion by the rules of Sokoban tells what can be "
-        "reached and the way to a push; a rule says where to look before each decision, for up to 30 instructions",
+        "reached and the way to a push; a tree search by these rules, guided by the network, looks ahead for a way to "
+        "the end (`--look-ahead 0`: none); a rule says where to look before each decision, for up to 30 instructions",
         {
             "imitation": "supervised, by an optimal solver, also on its own play",
             "expert-iteration": "by its own play and search, without a solver",

@@ -72,7 +72,7 @@ def graph_parameters(stack: Player, episodes: Episodes, *, run: int = 0, **simul
         parameters[role]["look_around"] = stack.look_around_ticks
     parameters["planner"] |= {
         "thinking": stack.deliberation.thinking,
-        "look_ahead": stack.deliberation.look_ahead,
+        "look_ahead": stack.deliberation.evaluations(stack.choices["planner"].source),
         "look_ahead_per_tick": stack.deliberation.per_tick,
         "look_ahead_certainty": stack.deliberation.certainty,
         "look_ahead_deadline": deadline,

@@ -305,7 +305,7 @@ def _recording(options: Options, name: str) -> Stage:
     command = (
         "-m", "bringup.record", "--out", str(run / name), "--episodes", str(episodes),
         "--seed", str(seed), "--run-seed", str(stream), "--time-limit", str(limit),
-        "--processes", str(cores), *_physics(options), *sense, *modules,
+        "--processes", str(cores), *_physics(options), "--look-ahead", "0", *sense, *modules,
     )  # fmt: skip
     seconds = _seconds(options, name)
     return Stage(name, command, (run / name,), tuple(needs.values()), seconds, cores, resumes=False)

@@ -37,8 +37,8 @@ class Evaluation(NamedTuple):
 
 
 EVALUATIONS: Final = {
-    "evaluation": Evaluation("all four modules"),
-    "evaluation_ahead": Evaluation("with a search ahead of 400 evaluations", ("--look-ahead", "400")),
+    "evaluation": Evaluation("all four modules, the planner's policy alone", ("--look-ahead", "0")),
+    "evaluation_ahead": Evaluation("all four modules, with a search ahead of 400 evaluations", ("--look-ahead", "400")),
 }
 """By the name of the stage."""
 _PLACE = Place("python -m bringup.train_all", None, "levels for validation by which nothing was chosen")

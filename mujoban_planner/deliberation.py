@@ -8,9 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from mujoban_core.plugins import LEARNED
+
 if TYPE_CHECKING:
     from mujoban_core.interfaces import Module
 
+LOOK_AHEAD: Final = 400
+"""Evaluations of a search ahead by the learned planner, where nobody says otherwise."""
 MOST_EVALUATIONS: Final = 10_000
 """Evaluations of a search ahead at most."""
 MOST_SECONDS: Final = 60.0
@@ -32,8 +36,9 @@ class Deliberation:
     thinking: int = 0
     """Repeats, per decision, of a recurrent core, relative to training, or of a thinking network's last blocks, or
     symmetric views of a residual network; 0 for the network's own."""
-    look_ahead: int = 0
-    """Evaluations of a tree search for a way to the end of the level; 0 for none."""
+    look_ahead: int | None = None
+    """Evaluations of a tree search for a way to the end of the level; 0 for none, None for `LOOK_AHEAD` by the learned
+    planner and none by any other."""
     per_tick: int = PER_TICK
     """Evaluations in one tick."""
     certainty: float = CERTAINTY
@@ -50,33 +55,42 @@ class Deliberation:
             ("certainty", 0.0, 1.0),
             ("deadline", 0.0, MOST_SECONDS),
         ):
-            if not least <= getattr(self, name) <= most:
-                raise ValueError(f"{name} is {getattr(self, name)}: expected {least} to {most}")
+            given = getattr(self, name)
+            if given is not None and not least <= given <= most:
+                raise ValueError(f"{name} is {given}: expected {least} to {most}")
 
-    def prepare(self, module: Module) -> Module:
-        """Let a planner think so long; return what plays in its place, or itself.
+    def evaluations(self, source: str = LEARNED) -> int:
+        """Return the evaluations of the search by a planner from a source, as `Choice.source` names it."""
+        if self.look_ahead is not None:
+            return self.look_ahead
+        return LOOK_AHEAD if source == LEARNED else 0
+
+    def prepare(self, module: Module, source: str = LEARNED) -> Module:
+        """Let a planner from a source think so long; return what plays in its place, or itself.
 
         Raises:
             ValueError: If it is no learned planner, and asked for more than it does anyway.
         """
-        if not self.thinking and not self.look_ahead:
+        look_ahead = self.evaluations(source)
+        if not self.thinking and not look_ahead:
             return module
         # They import PyTorch, which not every planner needs.
         from mujoban_planner.lookahead import LookAheadPlanner
         from mujoban_planner.planner import LearnedPlanner
 
         if not isinstance(module, LearnedPlanner):
-            asked = "look-ahead" if self.look_ahead else "thinking"
+            asked = "look-ahead" if look_ahead else "thinking"
             raise ValueError(f"{asked} with a {type(module).__name__}: expected a learned planner")
         if self.thinking:
             module.thinking = self.thinking
-        if not self.look_ahead:
+        if not look_ahead:
             return module
         return LookAheadPlanner(
-            module, self.look_ahead, per_tick=self.per_tick, certainty=self.certainty, deadline=self.deadline
+            module, look_ahead, per_tick=self.per_tick, certainty=self.certainty, deadline=self.deadline
         )
 
-    def settings(self) -> dict[str, int | float]:
-        """Return what a report says of it."""
+    def settings(self, source: str = LEARNED) -> dict[str, int | float]:
+        """Return what a report says of it, for a planner from a source."""
+        look_ahead = self.evaluations(source)
         search = {"look_ahead_per_tick": self.per_tick, "look_ahead_certainty": self.certainty}
-        return {"thinking": self.thinking, "look_ahead": self.look_ahead, **(search if self.look_ahead else {})}
+        return {"thinking": self.thinking, "look_ahead": look_ahead, **(search if look_ahead else {})}

@@ -5,14 +5,14 @@ every tick, or as many as fit into so much of it, so that an instruction is alwa
 boxes and where the robot can walk to, so that it goes on while the robot walks; before a push, which cannot be taken
 back, the robot waits for its end.
 
-Off by default everywhere; its results are reported on their own line.
+A memory without its searches, as a process keeps it for the one that comes after it (`resume_file`), does them again.
 
 Shapes: M robots, N = `grid.GRID_SIZE`, T moves.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -26,14 +26,29 @@ from mujoban_planner.boards import BitBoards, likeliest_boards, state_tensor
 from mujoban_planner.decision import PushMeans, VisitCounts, VisitMemory, count_visits, recall, remember, state_keys
 from mujoban_planner.deliberation import CERTAINTY, MOST_EVALUATIONS
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state, split_memory
-from mujoban_planner.search import LoneSearch, advance
+from mujoban_planner.search import LoneSearch, advance, boards_at
 from mujoban_planner.teacher import possible_pushes
 from mujoban_sokoban.bitboard import NONE, SQUARE_STEP, Bits, Int, bit, pushed
 
 _LIKELIER: Final = 0.5
 """Probability above which a wall or a box is taken for one, whatever certainty is asked for."""
 _NO_KEY: Final = -1
-_OWN: Final = 6
+_PLAN: Final = 5
+"""Arrays of the memory that are about the plan."""
+
+
+class SearchMemory(NamedTuple):
+    """What M robots remember of their searches."""
+
+    search: NDArray[Any]
+    """`LoneSearch`, which goes on, or None, [M]."""
+    start: NDArray[np.uint64]
+    """State from which it searches (`LoneSearch.origin`), [M, 4]."""
+    spent: NDArray[np.int64]
+    """Evaluations so far, [M]. So many from the start are the same search."""
+
+
+_OWN: Final = _PLAN + len(SearchMemory._fields)
 """Arrays of the memory before those of the planner alone."""
 
 
@@ -86,24 +101,27 @@ class LookAheadPlanner(Planner):
         """Return the memory at the start of `batch` episodes.
 
         It holds the plan, its cursor, the state that it continues from, the targets that it leads to, how often the
-        robot has waited since its last push, the search (None or a `LoneSearch`, which goes on), and the planner's
-        memory.
+        robot has waited since its last push, `SearchMemory`, and the planner's memory.
         """
         plan = np.zeros((batch, MOVE_LIMIT + 1), np.int64)
         expected = np.zeros(batch, np.int64), np.full(batch, _NO_KEY, np.int64), np.zeros(batch, np.uint64)
         waits = np.zeros(batch, np.int64)
-        return (plan, *expected, waits, np.full(batch, None, object), *self.planner.initial_memory(batch))
+        start = np.zeros((batch, len(BitBoards._fields)), np.uint64)
+        searches = SearchMemory(np.full(batch, None, object), start, np.zeros(batch, np.int64))
+        return (plan, *expected, waits, *searches, *self.planner.initial_memory(batch))
 
     def think(self, abstract_state: NDArray[np.float32], memory: Memory) -> Memory:
         """Go on with the searches."""
         del abstract_state  # what they are about is seen at the next decision
-        self._advance(memory[_OWN - 1])
-        return memory
+        searches = self._revived(memory)
+        self._advance(searches.search)
+        return (*memory[:_PLAN], *_noted(searches), *memory[_OWN:])
 
     def decide(self, abstract_state: NDArray[np.float32], memory: Memory) -> tuple[NDArray[np.int64], Memory]:
         """Return an instruction for each state, [M] from [M, N, N, 4], and the next memory; errors as the planner's."""
         check_abstract_state(abstract_state)
-        plan, cursor, expected, target, waits, searches = (np.array(x) for x in memory[:_OWN])
+        plan, cursor, expected, target, waits = (np.array(x) for x in memory[:_PLAN])
+        searches = self._revived(memory)
         visits, means = split_memory(memory[_OWN:])
         boards, every = likeliest_boards(abstract_state), np.arange(len(plan))
         holds = (state_keys(abstract_state) == expected) & (plan[every, cursor] != 0) & (boards.target == target)
@@ -114,7 +132,7 @@ class LookAheadPlanner(Planner):
         lost = np.flatnonzero(~holds)
         self._search(boards, lost, searches)
         for row in lost.tolist():
-            found = searches[row].solution(int(boards.agent[row]))
+            found = searches.search[row].solution(int(boards.agent[row]))
             if 0 < len(found) <= MOVE_LIMIT and self._is_certain(abstract_state[row], boards, row, found):
                 plan[row, : len(found)] = found
         target = np.where(holds, target, boards.target)
@@ -129,7 +147,7 @@ class LookAheadPlanner(Planner):
             plan[alone] = 0
         pushes = possible_pushes(boards) >> decision & 1 == 1
         # What is put off while a search may find better was not tried; not for ever where estimates flicker.
-        waiting = alone & pushes & (waits < self._patience) & _searching(searches)
+        waiting = alone & pushes & (waits < self._patience) & _searching(searches.search)
         decision[waiting] = Instruction.STAY
         waits = np.where(waiting, waits + 1, np.where(pushes, 0, waits))
         acting = np.flatnonzero(~waiting)
@@ -137,7 +155,7 @@ class LookAheadPlanner(Planner):
         visits = put_rows(visits, acting, acted)
         cursor = np.where(alone, 0, cursor + 1)
         expected = np.where(alone, _NO_KEY, _next_keys(abstract_state, decision))
-        return decision, (plan, cursor, expected, target, waits, searches, *visits, *means)
+        return decision, (plan, cursor, expected, target, waits, *_noted(searches), *visits, *means)
 
     def _advance(self, searches: NDArray[Any]) -> None:
         going = [search for search in searches if search is not None]
@@ -146,14 +164,23 @@ class LookAheadPlanner(Planner):
         else:
             self.evaluations += advance(going, self.planner, self.per_tick or self.expansions)
 
-    def _search(self, boards: BitBoards, rows: NDArray[np.int64], searches: NDArray[Any]) -> None:
+    def _revived(self, memory: Memory) -> SearchMemory:
+        """Return the searches of a memory; one that the process before this one did is done again."""
+        search, start, spent = (np.array(x) for x in memory[_PLAN:_OWN])
+        for row in np.flatnonzero(spent > 0).tolist():
+            if search[row] is None:
+                search[row] = LoneSearch(boards_at(start[row]), self.expansions, MOVE_LIMIT)
+                self.evaluations += advance([search[row]], self.planner, int(spent[row]))
+        return SearchMemory(search, start, spent)
+
+    def _search(self, boards: BitBoards, rows: NDArray[np.int64], searches: SearchMemory) -> None:
         """Start searches for the states in `rows`, but where there is one, and go on with them."""
         for row in rows.tolist():
             here = BitBoards._make(column[row : row + 1] for column in boards)
-            search: Any = searches[row]
+            search: Any = searches.search[row]
             if search is None or not search.concerns(here):
-                searches[row] = LoneSearch(here, self.expansions, MOVE_LIMIT)
-        self._advance(searches[rows])
+                searches.search[row] = LoneSearch(here, self.expansions, MOVE_LIMIT)
+        self._advance(searches.search[rows])
 
     def _is_certain(
         self, state: NDArray[np.float32], boards: BitBoards, row: int, instructions: NDArray[np.int64]
@@ -178,6 +205,14 @@ class LookAheadPlanner(Planner):
         before = recall(states[rows], PushMeans(*take_rows(means, rows)))
         chosen, after = self.planner.choose(states[rows], VisitCounts(*take_rows(counts, rows)), before)
         return chosen, PushMeans(*put_rows(means, rows, after))
+
+
+def _noted(searches: SearchMemory) -> SearchMemory:
+    """Return the memory of searches with where each began and how far it is."""
+    start, spent = searches.start, searches.spent
+    for row, search in enumerate(searches.search):
+        start[row], spent[row] = (0, 0) if search is None else (search.origin, search.spent)
+    return SearchMemory(searches.search, start, spent)
 
 
 def _searching(searches: NDArray[Any]) -> NDArray[np.bool_]:

@@ -38,7 +38,7 @@ class PlannerNode(ModuleNode[Planner]):
     Parameters, beside those of `ModuleNode`:
         thinking: Thinking time of the network, 0 for its own. Fixed when the node starts.
         look_ahead: Network evaluations of a tree search that looks for a way to the end of the level, spread over the
-            ticks; 0 for none. Fixed likewise.
+            ticks; 0 for none, -1 for 400 by the learned planner and none by any other. Fixed likewise.
         look_ahead_per_tick: Of them, in one tick. Fixed likewise.
         look_ahead_certainty: Probability with which all must be as it seems that a plan rests on. Fixed likewise.
         look_ahead_deadline: Seconds of a tick in which it searches, in the place of `look_ahead_per_tick`; 0 for none,
@@ -66,7 +66,7 @@ class PlannerNode(ModuleNode[Planner]):
         """Let the planner think as long as it is to."""
         if self._deliberation is None:
             self._deliberation = self._declare_deliberation()
-        return self._deliberation.prepare(module)
+        return self._deliberation.prepare(module, self._source)
 
     def _declare_deliberation(self) -> Deliberation:
         def number(name: str, default: int, about: str, low: int, high: int) -> int:
@@ -74,9 +74,11 @@ class PlannerNode(ModuleNode[Planner]):
 
         certain = described("probability of what a plan rests on", fixed=True, low=0.0, high=1.0)
         time = described("seconds of a tick for it instead; 0: by number", fixed=True, low=0.0, high=MOST_SECONDS)
+        thinking = number("thinking", 0, "thinking time of the network; 0: its own", 0, MOST_THINKING)
+        ahead = number("look_ahead", -1, "evaluations of a search ahead; 0: none, -1: its own", -1, MOST_EVALUATIONS)
         return Deliberation(
-            number("thinking", 0, "thinking time of the network; 0: its own", 0, MOST_THINKING),
-            number("look_ahead", 0, "evaluations of a search ahead; 0: none", 0, MOST_EVALUATIONS),
+            thinking,
+            None if ahead < 0 else ahead,
             number("look_ahead_per_tick", PER_TICK, "evaluations in a tick", 1, MOST_EVALUATIONS),
             declare(self, "look_ahead_certainty", CERTAINTY, certain),
             declare(self, "look_ahead_deadline", 0.0, time),

@@ -127,6 +127,11 @@ class LoneSearch:
         self.forest.plant(_FIRST, start)
 
     @property
+    def origin(self) -> NDArray[np.uint64]:
+        """The state that it started from, for `boards_at`, [4]."""
+        return np.array([column[0] for column in self.start], np.uint64)
+
+    @property
     def spent(self) -> int:
         """Evaluations so far."""
         return int(self.forest.expansions[0])
@@ -145,6 +150,12 @@ class LoneSearch:
     def solution(self, agent: int) -> NDArray[np.int64]:
         """Return the instructions that solve the level from where the robot is, [T]; none where none were found."""
         return _instructions(self.forest, self.start._replace(agent=np.array([agent], np.uint8)), 0)
+
+
+def boards_at(origin: NDArray[np.uint64]) -> BitBoards:
+    """Return the one state of `LoneSearch.origin`."""
+    wall, target, box, agent = origin[:, None]
+    return BitBoards(wall, target, box, agent.astype(np.uint8))
 
 
 def advance(

@@ -56,7 +56,7 @@ class Baseline:
     paper: str
     """How long the paper trained it, with how many actors."""
     roles: tuple[str, ...] = ()
-    """Modules that it leaves, in the place of an agent; they play with those that ship."""
+    """Modules that it leaves, in the place of an agent; they play with those that ship, without a search ahead."""
     program: str = "mujoban_baselines.train"
     budget: str = BUDGET
     weights: str = ""
@@ -83,7 +83,8 @@ class Baseline:
         folder = self.folder / self.weights
         if not self.roles:
             return replace(run, agent=folder / "agent.safetensors")
-        return replace(run, modules=tuple((role, folder / f"{role}.safetensors") for role in self.roles))
+        modules = tuple((role, folder / f"{role}.safetensors") for role in self.roles)
+        return replace(run, modules=modules, further=sources.ALONE)
 
 
 _ROBOT, _ABOVE = "o_cam, o_pr, o_pos", "o_top, o_pr"

@@ -42,7 +42,7 @@ def generate_launch_description() -> LaunchDescription:
         "body": ("ball", "the robot's body"),
         "world": ("reference", "the physical world"),
         "weights": ("", "folder of weights files, ROLE.safetensors, for the learned modules; empty: those that ship"),
-        "look_ahead": ("0", "evaluations of a search ahead by the planner"),
+        "look_ahead": ("-1", "evaluations of a search ahead by the planner, 0 for none, -1 for the planner's own"),
         "difficulty": ("5", "of the levels"),
         "realtime": ("1.0", "simulated seconds per second; 0.0 is lockstep"),
         "viz": ("true", "whether RViz and Foxglove get topics of their own"),

@@ -39,8 +39,8 @@ def test_without_sources_the_page_names_the_commands_that_make_them(folder, caps
     assert "Rows are of the *reference* world" in page
     assert "python -m benchmarks.paper.runs --only film_strip" in page
     assert "python -m benchmarks.paper.curves --controller RUN" in page
-    assert page.count("not measured |") == 25, (
-        "one row of Table 1, three of Table 2 and six beside, five of Figure 2, ten of Figure 5"
+    assert page.count("not measured |") == 26, (
+        "two rows of Table 1, three of Table 2 and six beside, five of Figure 2, ten of Figure 5"
     )
     assert "no source yet" in capsys.readouterr().err
 
@@ -62,6 +62,7 @@ def test_a_page_that_was_edited_or_is_missing_is_noticed(folder, capsys):
 def test_the_page_has_our_numbers_beside_the_papers_and_marks_other_weights(folder):
     shipped = {role: digest(shipped_weights(role)) for role in ROLES}
     write(runs.CONFIGURATIONS[0], 3, 4, shipped)
+    write(runs.POLICY_ALONE[0], 2, 4, shipped)
     write(runs.CONFIGURATIONS[2], 4, 4, {**shipped, "controller": "0" * 64})
     assert results.rebuild(folder) == folder / "README.md"
     page = (folder / "README.md").read_text()
@@ -211,12 +212,12 @@ def test_the_fine_tuned_stack_has_a_row_and_its_failures_beside_what_it_came_fro
     options = run.options()
     for role in ("controller", "planner"):
         assert options[options.index(f"--{role}") + 1] == str(runs.ROOT / f"runs/baselines/joint/{role}.safetensors")
-    write(runs.CONFIGURATIONS[0], 3, 4, {})
+    write(runs.POLICY_ALONE[0], 3, 4, {})
     write(run, 2, 4, {})
     page = results.rebuild(folder).read_text()
     assert "| modular, fine-tuned as a whole | o_cam, o_pr, o_pos |" in page and "50.0 % (15.0 to 85.0)" in page
     failures = page.split("before fine-tuning as a whole and after")[1].split("##")[0]
-    assert "| default |" in failures and "| modular, fine-tuned as a whole |" in failures
+    assert "| default, the planner's policy alone |" in failures and "| modular, fine-tuned as a whole |" in failures
 
 
 def test_every_row_is_trained_by_a_command_that_exists_with_the_same_budget(capsys):

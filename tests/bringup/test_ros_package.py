@@ -104,7 +104,7 @@ def test_the_launch_file_and_run_stack_have_the_same_defaults(launched):
     assert f"world:={DEFAULT_WORLD}" in simulator and f"body:={BALL.name}" in simulator
     usual = graph_parameters(Stack(), Episodes(1, 0), realtime=1.0)["planner"]
     (deadline,) = (float(word.partition(":=")[2]) for word in planner if word.startswith("look_ahead_deadline"))
-    assert deadline == pytest.approx(usual["look_ahead_deadline"]) and "look_ahead:=0" in planner
+    assert deadline == pytest.approx(usual["look_ahead_deadline"]) and "look_ahead:=-1" in planner
 
 
 def test_another_body_world_and_weights_are_launched_for_every_node(launched):

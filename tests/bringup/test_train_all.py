@@ -189,7 +189,8 @@ def test_the_report_stands_beside_weights_with_their_cards(tmp_path: Path) -> No
     options = Options(run=tmp_path)
     text = write_report(tmp_path, Pipeline(tmp_path, stages(options)), WEIGHTS).read_text()
     assert "levels of difficulty 5, seeds from 7000000, by which no stage chooses" in text
-    assert "| all four modules | 2 | **50.0%** | 10.0% to 90.0% | 7.00 | none |" in text and "search ahead" not in text
+    title = "all four modules, the planner's policy alone"
+    assert f"| {title} | 2 | **50.0%** | 10.0% to 90.0% | 7.00 | none |" in text and "search ahead" not in text
     assert "success_rate/5 0.75" in text
     card = (tmp_path / "weights" / "planner.md").read_text()
-    assert "| all four modules | none | 2 | 50.0 % | 10.0 to 90.0 % |" in card and "| success_rate/5 | 0.75 |" in card
+    assert f"| {title} | none | 2 | 50.0 % | 10.0 to 90.0 % |" in card and "| success_rate/5 | 0.75 |" in card

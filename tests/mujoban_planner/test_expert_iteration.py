@@ -89,13 +89,13 @@ def test_of_the_lessons_those_are_kept_in_which_the_planner_errs():
     for easy in (0.0, 1.0):
         actor = SearchActor(NETWORK, replace(SMALL, trees=64, easy=easy), 0, 0)
         actor.planner = load(compiled=False)
-        lessons = [actor.act().arrays for _ in range(12)]
+        lessons = [actor.act().arrays for _ in range(4)]
         samples = concatenate(
             [Samples._make(x[f"{kind}.{name}"] for name in Samples._fields) for x in lessons for kind in KINDS]
         )
         erred[easy] = errs(actor.planner, samples)
     assert erred[0.0].sum() > 0 and (~erred[0.0]).sum() < 3, "but for rounding, all"
-    assert (~erred[1.0]).sum() > 10
+    assert (~erred[1.0]).sum() > 3
 
 
 def test_a_solved_search_goes_on_to_judge_the_pushes_beside_its_way():

@@ -7,9 +7,10 @@ import torch
 
 from mujoban_core.grid import Instruction
 from mujoban_core.program import exit_status
+from mujoban_msgs_py.runtime.kept import leaves, with_leaves
 from mujoban_planner import evaluate, load
 from mujoban_planner.boards import abstract_states, bit_boards, take_levels
-from mujoban_planner.deliberation import Deliberation
+from mujoban_planner.deliberation import LOOK_AHEAD, Deliberation
 from mujoban_planner.lookahead import LookAheadPlanner
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.planner import split_memory
@@ -133,7 +134,28 @@ def test_a_robot_waits_for_one_search_at_most_where_estimates_flicker_and_forget
         decision, memory = player.decide(states[tick % 2], memory)
         decisions.append(int(decision[0]))
     assert decisions == [Instruction.STAY] * 300 + [Instruction.EAST] + [Instruction.STAY] * 9
-    assert split_memory(memory[6:])[0].count[0] == 1, "what was put off was not tried"
+    assert split_memory(memory[8:])[0].count[0] == 1, "what was put off was not tried"
+
+
+@pytest.mark.parametrize("per_tick", [3, 400])
+def test_a_search_goes_on_in_the_process_that_comes_after_a_killed_one(planner, per_tick):
+    level = take_levels(generate_batch(5, range(100, 101)), np.array([0]))
+
+    def played(kill):
+        player, levels = LookAheadPlanner(planner, 400, per_tick=per_tick), level
+        state, decisions = player.initial_state(np.zeros(1, np.int64)), []
+        for tick in range(150):
+            if kill and tick % 7 == 5:
+                player = LookAheadPlanner(planner, 400, per_tick=per_tick)
+                state = with_leaves(player.initial_state(np.zeros(1, np.int64)), leaves(state))
+            instruction, state = player.step(abstract_states(levels), np.array([tick % 3 == 0]), state)
+            if tick % 3 == 0:
+                decisions.append(int(instruction[0]))
+                result = rules.apply(*levels, instruction)
+                levels = levels._replace(boxes=result.boxes, player=result.player)
+        return decisions
+
+    assert played(kill=True) == played(kill=False)
 
 
 def _pushes(levels, decisions):
@@ -188,7 +210,9 @@ def test_what_a_plan_has_left_behind_need_not_be_certain(planner):
 
 
 def test_only_the_learned_planner_thinks_longer(planner):
-    assert Deliberation().prepare(planner) is planner and planner.thinking == 1
+    assert Deliberation(look_ahead=0).prepare(planner) is planner and planner.thinking == 1
+    assert Deliberation().prepare(planner).expansions == LOOK_AHEAD
+    assert Deliberation().prepare(planner, "oracle") is Deliberation().prepare(planner, "my:Own") is planner
     searching = Deliberation(look_ahead=100, per_tick=7, certainty=0.8).prepare(planner)
     assert (searching.expansions, searching.per_tick, searching.certainty) == (100, 7, 0.8)
     for asked in (Deliberation(look_ahead=100), Deliberation(thinking=2)):
@@ -200,7 +224,7 @@ def test_thinking_time_reaches_the_network():
     network, state = load(compiled=False), torch.from_numpy(abstract_states(generate_batch(5, range(2))))
     with torch.inference_mode():
         quick = network(state).push
-        Deliberation(thinking=3).prepare(network)
+        Deliberation(thinking=3, look_ahead=0).prepare(network)
         assert network.thinking == 3 and not torch.equal(network(state).push, quick)
 
 
