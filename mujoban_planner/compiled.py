@@ -14,7 +14,7 @@ from mujoban_rl.compiled import Signature
 
 DECISION: Final = Signature(
     inputs=("states", "seen", "push", "push_alive", "penalty", "caution"),
-    outputs=("score", "push_after", "push_alive_after"),
+    outputs=("score", "push_after", "push_alive_after", "alive"),
     tolerance=0.05,
 )
 """`LearnedPlanner.weigh`."""

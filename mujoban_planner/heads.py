@@ -58,6 +58,8 @@ class Weighed(NamedTuple):
     """Log-probability of each next push, the mean over the views so far, [B, D, I, I]."""
     push_alive: Tensor
     """log(1 - p(dead)) of each push, likewise."""
+    alive: Tensor
+    """log(1 - p(dead | s)) of the state itself, [B]."""
 
 
 class PlannerHeads(nn.Module):

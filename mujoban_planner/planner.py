@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_core.grid import CHANNELS, GRID_SIZE
+from mujoban_core.grid import CHANNELS, GRID_SIZE, Instruction
 from mujoban_core.interfaces import Memory, Planner, put_rows, take_rows
 from mujoban_planner.decision import (
     PushMeans,
@@ -178,10 +178,10 @@ class LearnedPlanner(Compilable, Planner):
         inputs = (abstract_state, means.views, means.push, means.push_alive, penalty, np.array(self.caution))
         inputs = [np.ascontiguousarray(x, np.int64 if x.dtype.kind == "i" else np.float32) for x in inputs]
         if self.compiled is not None and len(abstract_state) == self.thinking == 1:
-            score, push, push_alive = self.compiled(inputs)
+            score, push, push_alive, _ = self.compiled(inputs)
         else:
             weighed = self.weigh(*(torch.from_numpy(x).to(self.device) for x in inputs))
-            score, push, push_alive = (x.cpu().numpy() for x in weighed)
+            score, push, push_alive, _ = (x.cpu().numpy() for x in weighed)
         means = PushMeans(means.boxes, means.views + self.views, push, push_alive)
         return score.astype(np.float64) - visit_penalty(counts), means
 
@@ -205,7 +205,8 @@ class LearnedPlanner(Compilable, Planner):
         push_alive = running_mean(self.views, seen, push_alive, advice.push_alive)
         wanted = push + caution * push_alive - penalty
         policy = advice.policy + self.heads.guide(wanted, input_planes(states))
-        return Weighed(functional.log_softmax(policy, 1) + caution * advice.alive, push, push_alive)
+        score = functional.log_softmax(policy, 1) + caution * advice.alive
+        return Weighed(score, push, push_alive, advice.alive[:, Instruction.STAY])
 
     @property
     def views(self) -> int:

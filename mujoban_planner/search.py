@@ -25,9 +25,10 @@ from mujoban_core.grid import CHANNELS, GRID_SIZE, Instruction
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.forest import Forest
 from mujoban_planner.forest_kernels import region_of
-from mujoban_planner.heads import verdicts
+from mujoban_planner.heads import INTERIOR, verdicts
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.shortening import shorten
+from mujoban_rl.compiled import CompiledGraph
 from mujoban_rl.precision import autocast
 from mujoban_sokoban.solver_labels import moves_of
 
@@ -77,7 +78,10 @@ def grow(forest: Forest, rows: NDArray[np.int64], evaluate: Evaluation) -> None:
 
 def evaluate_boards(planner: LearnedPlanner, boards: BitBoards) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return how promising pushes are, as log-probabilities, [M, 4, I * I], and log p(alive), [M]."""
-    push, alive = _judge(planner, state_tensor(boards).to(planner.device))
+    states = state_tensor(boards)
+    if planner.compiled is not None and len(states) == 1:
+        return _judge_one(planner.compiled, states.numpy())
+    push, alive = _judge(planner, states.to(planner.device))
     return push.cpu().numpy(), alive.cpu().numpy()
 
 
@@ -87,6 +91,14 @@ def _judge(planner: LearnedPlanner, states: Tensor) -> tuple[Tensor, Tensor]:
     alive = functional.logsigmoid(-output.dead[:, Instruction.STAY])
     push = output.push + verdicts(output)
     return push.flatten(2).float(), alive.float()
+
+
+def _judge_one(decision: CompiledGraph, state: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return what `_judge` does of a state, [1, N, N, 4], by the graph of a decision that has seen nothing before."""
+    nothing = np.zeros((1, len(Instruction) - 1, INTERIOR, INTERIOR), np.float32)
+    seen, caution = np.zeros(1, np.int64), np.array(1.0, np.float32)
+    _, push, push_alive, alive = decision([state, seen, nothing, nothing, nothing, caution])
+    return (push + push_alive).reshape(1, len(Instruction) - 1, -1), alive
 
 
 class GraphedEvaluation:

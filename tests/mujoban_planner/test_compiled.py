@@ -9,11 +9,12 @@ import torch
 
 import mujoban_planner
 from mujoban_core.files import digest
-from mujoban_planner.boards import abstract_states
+from mujoban_planner.boards import abstract_states, bit_boards, take_levels
 from mujoban_planner.decision import count_visits, initial_means, initial_visits
 from mujoban_planner.export import export
 from mujoban_planner.networks import RecurrentPlanner
 from mujoban_planner.play import play
+from mujoban_planner.search import evaluate_boards
 from mujoban_rl.compiled import graph_path
 from mujoban_rl.weights import WeightsError, save_weights
 from mujoban_sokoban.generator import generate_batch
@@ -53,6 +54,15 @@ def test_shipped_planner_decides_in_its_graph_as_in_pytorch():
             (decision, a), (expected, b) = compiled.decide(blurred, a), plain.decide(blurred, b)
             assert decision == expected
             assert all(np.allclose(x, y, atol=0.05, rtol=1e-4) for x, y in zip(a, b, strict=True))
+
+
+def test_a_search_judges_one_state_by_the_graph_as_in_pytorch(monkeypatch):
+    compiled, plain = mujoban_planner.load(), mujoban_planner.load(compiled=False)
+    monkeypatch.setattr(compiled, "read", lambda state: pytest.fail("it has a graph for one state"))
+    for i in range(len(LEVELS.wall)):
+        boards = bit_boards(take_levels(LEVELS, np.array([i])))
+        for said, expected in zip(evaluate_boards(compiled, boards), evaluate_boards(plain, boards), strict=True):
+            assert np.allclose(said, expected, atol=1e-3)
 
 
 def test_shipped_graph_solves_levels_one_by_one():
