@@ -21,7 +21,7 @@ from mujoban_core.interfaces import Estimator, EstimatorInput, Memory
 from mujoban_core.ranges import check_counts
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.geometry import ANCHORS, CELLS, FEATURES, cell_geometry
-from mujoban_rl.compiled import Compilable
+from mujoban_rl.compiled import Compilable, bounded_sigmoid
 
 BINARY: Final = (WALL, TARGET, BOX)
 """Layers with an independent classifier per cell; the agent's is one softmax over all cells."""
@@ -296,7 +296,7 @@ class StateEstimator(Compilable, Estimator):
 
 def probabilities(logits: Tensor) -> Tensor:
     """Return the probability of each layer in each cell; both [..., 10, 10, 4]."""
-    binary = torch.sigmoid(logits)
+    binary = bounded_sigmoid(logits)
     agent = torch.softmax(logits[..., AGENT].flatten(-2), dim=-1).unflatten(-1, (GRID_SIZE, GRID_SIZE))
     binary[..., AGENT] = agent
     return binary

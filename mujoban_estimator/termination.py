@@ -21,7 +21,7 @@ from mujoban_core.interfaces import Memory, Termination, TerminationInput
 from mujoban_core.ranges import check_counts
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
 from mujoban_estimator.odometry import FEATURES, Odometry, Track, turn
-from mujoban_rl.compiled import Compilable
+from mujoban_rl.compiled import Compilable, bounded_sigmoid
 from mujoban_rl.ticks import tick_arrays
 
 PHASES: Final = 4
@@ -180,7 +180,7 @@ class ControlTermination(Compilable, Termination):
         progress, after = self.odometry(felt, instruction[:, None], terminated[:, None], Track(*track))
         keep = (~terminated)[:, None].to(hidden.dtype)
         output = self(self.encoder(frame)[:, None], progress, felt, hidden * keep, cell * keep)
-        return (torch.sigmoid(output.logits[:, 0]), output.hidden, output.cell, *after)
+        return (bounded_sigmoid(output.logits[:, 0]), output.hidden, output.cell, *after)
 
 
 def true_phases(pose: Tensor, direction: Tensor, cell_size: float) -> Tensor:

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from mujoban_rl.weights import WEIGHTS_LIMIT, WeightsError, read_bounded
 
@@ -119,6 +119,11 @@ class Compilable(nn.Module):
         if mode:
             self.compiled = None
         return super().train(mode)
+
+
+def bounded_sigmoid(logits: Tensor) -> Tensor:
+    """Return the probabilities of logits, of any shape, at most 1: ONNX Runtime's sigmoid can exceed it by rounding."""
+    return torch.sigmoid(logits).clamp(max=1.0)
 
 
 def load_graph(

@@ -3,10 +3,13 @@ import pytest
 import torch
 
 import mujoban_estimator
+from mujoban_core.files import digest
 from mujoban_core.interfaces import EstimatorInput, TerminationInput
-from mujoban_estimator.estimator import StateEstimator
+from mujoban_estimator.estimator import StateEstimator, probabilities
 from mujoban_estimator.export import export_estimator, export_termination
 from mujoban_estimator.termination import ControlTermination
+from mujoban_rl.compiled import CompiledGraph, Signature, graph_path
+from mujoban_rl.export import export_graph
 from mujoban_rl.testing import robot_ticks
 from mujoban_rl.weights import save_weights
 
@@ -58,6 +61,16 @@ def test_the_estimate_follows_from_the_graph_as_in_pytorch(tmp_path, body):
         (said, a), (expected, b) = compiled.step(inputs, a), plain.step(inputs, b)
         assert said.shape == (1, 10, 10, 4) and np.allclose(said, expected, atol=1e-3)
         assert all(np.allclose(x, y, atol=1e-3) for x, y in zip(a, b, strict=True))
+
+
+def test_no_probability_of_a_graph_is_above_one(tmp_path):
+    weights, logits = tmp_path / "logits.safetensors", torch.full((1, 10, 10, 4), 17.86892318725586)
+    nothing = torch.nn.Linear(1, 1)
+    save_weights(weights, nothing, {}, {})
+    signature = Signature(("logits",), ("estimate",), 0.0)
+    export_graph(weights, nothing, lambda x: [probabilities(x)], [logits], signature)
+    (said,) = CompiledGraph(graph_path(weights), digest(graph_path(weights)), signature)([logits.numpy()])
+    assert said[..., 0].max() == 1.0, "ONNX Runtime's sigmoid of this number is 1.0000001"
 
 
 def test_what_learns_on_leaves_the_graph_of_its_old_weights():
