@@ -71,7 +71,7 @@ def test_imitation_that_is_terminated_and_resumed_equals_one_that_never_stopped(
     def make(path):
         # Lessons from another process are those that this one makes in the same order.
         where = ActorOptions(actors if path.name == "parts" else "local", schedule=schedule)
-        runs.append(_imitation(path, where, stock=1, enough=500, levels=8))
+        runs.append(_imitation(path, where, stock=1, enough=200, levels=2))
         return runs[-1]
 
     check_resuming(make, tmp_path, stop_at=5, updates=7)
