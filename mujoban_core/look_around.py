@@ -7,12 +7,11 @@ the robot comes to rest in the middle of its cell, which after a push it is not 
 that no single action turns has a controller that has learned to turn when it is told to stay, and needs the first
 alone.
 
-Shapes: B robots, M of them with a decision to take, V viewpoints, N = `grid.GRID_SIZE`, U actuators.
+Shapes: B robots, M of them with a decision to take, N = `grid.GRID_SIZE`, U actuators.
 """
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Final, TypeVar
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import BALL, Body
-from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, OFFSETS_XY, WALL, Instruction
+from mujoban_core.grid import GRID_SIZE, Instruction
 from mujoban_core.interfaces import (
     Controller,
     ControllerInput,
@@ -32,31 +31,16 @@ from mujoban_core.interfaces import (
     put_rows,
     take_rows,
 )
-from mujoban_core.visibility import cells_in_view
+from mujoban_core.viewpoints import step_to_view, turn_view, walk_view
 
 LOOKING_ROLES: Final = ("planner", "controller")
 """The roles that `look_around` wraps."""
 WALKS: Final = 30
 """Instructions that an episode spends at most on looks after the first and on the way there, by default."""
-MIN_GAIN: Final = 3
-"""Cells that a viewpoint must promise to be worth a walk."""
-_UNCERTAIN: Final = (0.05, 0.95)
-"""A cell is unknown where the probability of a wall lies between these and it has not been in view."""
-_OPAQUE: Final = 0.9
-"""Probability of a wall from which on it hides what lies behind; guesses about unseen cells stay below."""
-FREE: Final = 0.3
-"""Probability of a wall or a box up to which the robot dares to walk into a cell."""
-_WALK_COST: Final = 0.5
-"""Cells of gain that one step of the way is worth."""
-TURN_HEADINGS: Final = 0.4 * math.pi * np.arange(5)
-"""Views that together make a turn, given the camera's 80 degrees."""
-WALK_HEADINGS: Final = np.arctan2(OFFSETS_XY[:, 1], OFFSETS_XY[:, 0])
-"""Direction of travel of each instruction in radians; that of STAY is not used."""
 _COMING_TO_REST: Final = -1
 """In the place of the tick at which a look ends: it begins when the robot has stayed."""
 _AT_REST: Final = 10
 """Ticks for which a robot turns after it was told that it has stayed; then it may have left the middle of its cell."""
-_CELLS: Final = GRID_SIZE * GRID_SIZE
 _OWN: Final = 5
 """Parts of the memory that are the wrapper's own."""
 
@@ -215,80 +199,3 @@ def look_around(
     if isinstance(module, Controller) and body.turn is not None:
         return LookAroundController(module, body.turn)
     return module
-
-
-def step_to_view(
-    abstract_state: NDArray[np.float32], seen: NDArray[np.bool_], body: Body = BALL
-) -> Instruction | None:
-    """Return the first step to where a turn shows most that is unknown; STAY for here, None if nowhere does.
-
-    Args:
-        abstract_state: Estimate, [N, N, 4].
-        seen: Cells that have been in view, [N, N].
-        body: Carries the camera.
-    """
-    wall = abstract_state[..., WALL]
-    unknown = (wall > _UNCERTAIN[0]) & (wall < _UNCERTAIN[1]) & ~seen
-    unknown[[0, -1]] = unknown[:, [0, -1]] = False
-    if unknown.sum() < MIN_GAIN:
-        return None
-    distance, first = _walks(abstract_state)
-    cells = np.flatnonzero(distance >= 0)
-    gain = (_views(wall, cells, body) & unknown.ravel()).sum(1)
-    worth = np.where(gain >= MIN_GAIN, gain - _WALK_COST * distance[cells], -np.inf)
-    best = int(np.argmax(worth))
-    return Instruction(int(first[cells[best]])) if np.isfinite(worth[best]) else None
-
-
-def turn_view(abstract_state: NDArray[np.float32], body: Body = BALL) -> NDArray[np.bool_]:
-    """Return which cells a turn in the robot's cell shows a body, by an estimate, [N, N] from [N, N, 4]."""
-    here = np.argmax(abstract_state[..., AGENT])
-    return _views(abstract_state[..., WALL], np.array([here]), body).reshape(GRID_SIZE, GRID_SIZE)
-
-
-def walk_view(
-    abstract_state: NDArray[np.float32], direction: Instruction, body: Body = BALL
-) -> NDArray[np.bool_]:
-    """Return which cells a robot sees that has walked into its cell in a direction, by an estimate, [N, N].
-
-    A body that is alike from several sides may look another way: of what it sees nothing is known.
-    """
-    if body.symmetry.sides > 1:
-        return np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
-    here, heading = np.argmax(abstract_state[..., AGENT]), WALK_HEADINGS[[direction]]
-    return _views(abstract_state[..., WALL], np.array([here]), body, heading).reshape(GRID_SIZE, GRID_SIZE)
-
-
-def _views(
-    wall: NDArray[np.float32],
-    cells: NDArray[np.int64],
-    body: Body,
-    headings: NDArray[np.floating] = TURN_HEADINGS,
-) -> NDArray[np.bool_]:
-    """Return which cells are seen from each of `cells`, [V], with any of some headings, [V, N * N]."""
-    half = (GRID_SIZE - 1) / 2
-    x, y = body.cell_size * (cells % GRID_SIZE - half), body.cell_size * (half - cells // GRID_SIZE)
-    turns = len(headings)
-    pose = np.stack([np.repeat(x, turns), np.repeat(y, turns), np.tile(headings, len(cells))], -1)
-    opaque = np.broadcast_to(wall > _OPAQUE, (len(pose), GRID_SIZE, GRID_SIZE))
-    view = cells_in_view(opaque, pose, body.camera, body.cell_size)
-    return np.any(view.reshape(len(cells), turns, _CELLS), axis=1)
-
-
-def _walks(abstract_state: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the walking distance to each cell, [N * N], -1 where none leads, and the first step of the way."""
-    free = (abstract_state[..., WALL] < FREE) & (abstract_state[..., BOX] < FREE)
-    # A level ends in walls whatever an estimate says, and nobody walks off the grid.
-    free[[0, -1]] = free[:, [0, -1]] = False
-    distance, first = np.full(_CELLS, -1), np.full(_CELLS, int(Instruction.STAY))
-    start = int(np.argmax(abstract_state[..., AGENT]))
-    distance[start], queue = 0, [start]
-    for cell in queue:
-        for instruction in list(Instruction)[1:]:
-            row, column = np.array(divmod(cell, GRID_SIZE)) + OFFSETS_RC[instruction]
-            beside = int(row * GRID_SIZE + column)
-            if 0 <= row < GRID_SIZE and 0 <= column < GRID_SIZE and free[row, column] and distance[beside] < 0:
-                distance[beside] = distance[cell] + 1
-                first[beside] = instruction if cell == start else first[cell]
-                queue.append(beside)
-    return distance, first

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from mujoban_core.bodies import BALL
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
-from mujoban_core.look_around import TURN_HEADINGS, WALK_HEADINGS, WALKS
+from mujoban_core.look_around import WALKS
+from mujoban_core.viewpoints import TURN_HEADINGS, WALK_HEADINGS
 from mujoban_core.visibility import cells_in_view
 from mujoban_planner.uncertainty import BORDER, guesses, visible
 from mujoban_rl.engine import State

@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
-from mujoban_core.look_around import FREE, Scout
+from mujoban_core.look_around import Scout
+from mujoban_core.viewpoints import FREE
 from mujoban_planner.exploration_env import CHANNELS
 from mujoban_planner.networks import ResidualBlock
 from mujoban_rl.weights import load_weights

@@ -11,7 +11,8 @@ from bringup.overlay import grid_picture
 from bringup.view import grid_text
 from mujoban_core.grid import AGENT, BOX, TARGET, Instruction
 from mujoban_core.interfaces import ControllerInput, GroundTruth
-from mujoban_core.look_around import LookAroundPlanner, step_to_view, turn_view
+from mujoban_core.look_around import LookAroundPlanner
+from mujoban_core.viewpoints import step_to_view, turn_view
 from mujoban_planner import load
 from mujoban_sim.oracles import OracleController, OraclePlanner
 

@@ -6,8 +6,9 @@ from bringup.rollout import ticks
 from mujoban_core.bodies import ANT, BALL, BODIES
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
 from mujoban_core.interfaces import ControllerInput, Planner
-from mujoban_core.look_around import LookAroundPlanner, Scout, look_around, step_to_view, walk_view
+from mujoban_core.look_around import LookAroundPlanner, Scout, look_around
 from mujoban_core.sense_plan_act import SensePlanAct
+from mujoban_core.viewpoints import step_to_view, walk_view
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
