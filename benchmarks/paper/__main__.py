@@ -24,8 +24,8 @@ from benchmarks.paper.runs import (
     RESULTS,
     SEED,
     Run,
-    is_stale,
 )
+from mujoban_core.bodies import ANT, BALL
 from mujoban_core.program import read_options, run_command
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.rendering import RenderingError
@@ -35,7 +35,7 @@ INTRODUCTION = f"""# Results
 `make results` rebuilds this page and its figures from the files in `json/`, in seconds. What lies there was measured by
 
     python -m benchmarks.paper.runs                    # everything: hours on two cores; goes on where it was ended
-    python -m benchmarks.paper.runs --only NAME        # one row, by the name in its table, or film_strip
+    python -m benchmarks.paper.runs --only NAME        # one row, by the name in its table, film_strip or film_strip_ant
     python -m benchmarks.paper.curves --help           # learning curves from the run directories of trainers
 
 Rows are of the *{DEFAULT_WORLD}* world, the environment that the paper's authors released, as measured in its recorded
@@ -106,7 +106,7 @@ def rebuild(folder: Path) -> Path:
         tables.test_uses(ALL),
         *_figure_2(DIFFICULTY, folder),
         "## Figure 3: an episode\n",
-        *_figure_3(folder),
+        *_film_strip(BALL.name, "Figure 3", folder / "figure3.png"),
         "## Figure 4: learning curves\n",
         *_figure_4(folder),
         "## Figure 5: another body, the same planner\n",
@@ -114,6 +114,7 @@ def rebuild(folder: Path) -> Path:
         tables.configurations(bodies.RUNS),
         tables.test_uses(bodies.RUNS),
         *_figure_5(folder),
+        *_film_strip(ANT.name, "An episode of the ant", folder / "figure5_ant.png"),
     ]
     page = folder / PAGE
     page.write_text("\n".join(sections))
@@ -140,21 +141,22 @@ def _baseline_curves(folder: Path) -> list[str]:
     return _missing("The curves of agents", "python -m benchmarks.paper.baselines NAME=RUN")
 
 
-def _figure_3(folder: Path) -> list[str]:
-    episode = film.load()
+def _film_strip(body: str, what: str, file: Path) -> list[str]:
+    recorded = film.FILMS[body]
+    episode = film.load(recorded)
     if episode is None:
-        return _missing("Figure 3", film.RERUN)
-    file = folder / "figure3.png"
+        return _missing(what, recorded.rerun)
     try:
         film.draw(episode, file)
     except RenderingError as error:
-        print(f"Figure 3 stays as it was: {error}", file=sys.stderr)
+        print(f"{what} stays as it was: {error}", file=sys.stderr)
+    stale = tables.STALE if film.is_stale(recorded, episode) else ""
     text = (
         f"What the robot sees, above the view from above that it does not see; seed {episode['seed']}, difficulty "
         f"{episode['difficulty']}, solved in {len(episode['torque'])} steps with {len(episode['instructions'])} "
-        f"instructions. Arrows are the instruction in force.{tables.STALE if is_stale(episode) else ''}\n"
+        f"instructions. Arrows are the instruction in force.{stale}\n"
     )
-    return [text, "![Frames of an episode that was solved](figure3.png)\n"]
+    return [text, f"![Frames of an episode that was solved]({file.name})\n"]
 
 
 def _figure_4(folder: Path) -> list[str]:

@@ -1,6 +1,6 @@
 """A short animation for pages: `python -m benchmarks.paper.animation docs/images/episode.gif`.
 
-Plays the recorded episode of Figure 3 again and draws what the robot sees beside the view from above.
+Plays a recorded episode again, by default that of Figure 3, and draws what the robot sees beside the view from above.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import tyro
 from PIL import Image
 
 from benchmarks.paper import film
+from bringup.options import one_of
+from mujoban_core.bodies import BALL
 from mujoban_core.program import read_options, run_command
 
 PROG: Final = "benchmarks.paper.animation"
@@ -25,6 +27,8 @@ class Options:
     """What is drawn."""
 
     path: Annotated[Path, tyro.conf.Positional] = Path("docs/images/episode.gif")
+    body: Annotated[str, one_of(sorted(film.FILMS))] = BALL.name
+    """Whose episode."""
     frames: int = 60
     size: int = 320
     """Pixels along the edges of each of the two pictures."""
@@ -40,9 +44,10 @@ def draw(options: Options) -> None:
         ValueError: If no episode has been recorded, or the world has changed since.
         RenderingError: If there is no OpenGL.
     """
-    episode = film.load()
+    recorded = film.FILMS[options.body]
+    episode = film.load(recorded)
     if episode is None:
-        raise ValueError(f"no episode has been recorded yet: {film.RERUN}")
+        raise ValueError(f"no episode has been recorded yet: {recorded.rerun}")
     moments = np.linspace(0, len(episode["torque"]), options.frames).round().astype(int)
     pictures: list[Image.Image] = []
     for _, first_person, top_down in film.play(episode, moments.tolist(), top_size=options.size):

@@ -20,7 +20,7 @@ from mujoban_sim.presets import REFERENCE
 _PAPER: Final = {BALL.name: 0.818, ANT.name: 0.737}
 """Success at difficulty 5 (paper A.3)."""
 _WEIGHTS: Final = ROOT / "mujoban_controller" / "weights"
-_CONTROLLERS: Final = {
+CONTROLLERS: Final = {
     BALL.name: _WEIGHTS / "controller_ball.safetensors",
     ANT.name: _WEIGHTS / "teacher_ant.safetensors",
 }
@@ -36,11 +36,11 @@ def _run(body: str, difficulty: int) -> Run:
     return Run(
         f"{body}_{difficulty}", f"{_TITLES[body]}, difficulty {difficulty}", difficulty, SENSE,
         _PAPER[body] if difficulty == max(DIFFICULTIES) else None, body=body, world=REFERENCE.name,
-        modules=(("controller", _CONTROLLERS[body]),),
+        modules=(("controller", CONTROLLERS[body]),),
     )  # fmt: skip
 
 
-BODIES: Final = {body: tuple(_run(body, d) for d in DIFFICULTIES) for body in _CONTROLLERS}
+BODIES: Final = {body: tuple(_run(body, d) for d in DIFFICULTIES) for body in CONTROLLERS}
 """The evaluations of each body, difficulty 1 to 5, in the reference world."""
 RUNS: Final = tuple(run for runs in BODIES.values() for run in runs)
 

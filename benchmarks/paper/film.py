@@ -1,4 +1,4 @@
-"""Figure 3: an episode that the learned modules solved, as a film strip (paper Fig. 3).
+"""Film strips: an episode that the learned modules solved (paper Fig. 3), and one of the ant's (paper Fig. 5).
 
 `record` plays test levels until one is solved and keeps the episode as JSON: its seed, the torques, the instructions
 and the digests of the weights. Physics is deterministic, so `draw` plays the torques again, without any network, and
@@ -8,6 +8,7 @@ draws frames where it likes.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,21 +20,19 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from benchmarks.paper import runs
-from benchmarks.paper.runs import SEED, ResultError, read_source
-from bringup.command import Choice, Stack
+from benchmarks.paper import bodies, runs
+from benchmarks.paper.runs import SEED, SENSE, ResultError, read_source
+from bringup.command import Choice, Stack, oracle
 from bringup.rollout import ticks
-from mujoban_core.grid import CONTROL_PERIOD, Instruction
-from mujoban_core.plugins import LEARNED, ROLES
+from mujoban_core.bodies import ANT, BALL
+from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES, Instruction
+from mujoban_core.plugins import ROLES
 from mujoban_core.reports import write_report
 from mujoban_rl.sealed_levels import noted_use
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
-NAME: Final = "film_strip"
-RERUN: Final = f"python -m benchmarks.paper.runs --only {NAME}"
-DIFFICULTY: Final = 5
 _CANDIDATES: Final = 8
 """Levels that are played side by side; the one that is solved first is kept."""
 _COLUMNS: Final = 8
@@ -42,19 +41,50 @@ _TOP_SIZE: Final = 256
 _ARROWS: Final = dict(zip(Instruction, "•↑→↓←", strict=True))
 
 
-def source() -> Path:
-    """Return where the episode lies."""
-    return runs.JSON / f"{NAME}.json"
+@dataclass(frozen=True)
+class Film:
+    """An episode that is kept."""
+
+    name: str
+    stack: Stack
+    """What plays."""
+    difficulty: int = max(DIFFICULTIES)
+    seed: int = SEED
+    """Of the first level."""
+
+    @property
+    def source(self) -> Path:
+        """Where the episode lies."""
+        return runs.JSON / f"{self.name}.json"
+
+    @property
+    def rerun(self) -> str:
+        """The command that records it."""
+        return f"python -m benchmarks.paper.runs --only {self.name}"
 
 
-def record(seed: int = SEED, difficulty: int = DIFFICULTY, stack: Stack | None = None) -> None:
-    """Play levels, by default with the learned modules, and write the first episode that is solved.
+FILMS: Final = {
+    BALL.name: Film("film_strip", Stack()),
+    ANT.name: Film(
+        "film_strip_ant",
+        Stack(
+            {role: oracle(role, ANT.name) if role in SENSE else Choice(role) for role in ROLES}
+            | {"controller": Choice("controller", weights=bodies.CONTROLLERS[ANT.name])},
+            body=ANT.name,
+        ),
+    ),
+}
+"""By the body that is seen; what the ant senses is known, as in Figure 5."""
+
+
+def record(film: Film) -> None:
+    """Play levels and write the first episode that is solved.
 
     Raises:
         ResultError: If none of them is solved.
     """
-    stack = stack or Stack({role: Choice(role, LEARNED) for role in ROLES})
-    episodes = Episodes(_CANDIDATES, seed, difficulty=difficulty)
+    stack, seed = film.stack, film.seed
+    episodes = Episodes(_CANDIDATES, seed, difficulty=film.difficulty)
     torque: list[list[NDArray[np.float32]]] = [[] for _ in episodes]
     instructions: list[list[tuple[int, int]]] = [[] for _ in episodes]
     world = World(len(episodes), body=stack.body, max_boxes=episodes.max_boxes)
@@ -71,7 +101,7 @@ def record(seed: int = SEED, difficulty: int = DIFFICULTY, stack: Stack | None =
         raise ResultError(f"none of {len(episodes)} levels from seed {seed} on was solved: no film strip")
     content: dict[str, Any] = {
         "seed": seed + first,
-        "difficulty": difficulty,
+        "difficulty": film.difficulty,
         "body": stack.body,
         "world": DEFAULT_WORLD,
         "weights": stack.identities(),
@@ -80,20 +110,26 @@ def record(seed: int = SEED, difficulty: int = DIFFICULTY, stack: Stack | None =
         "torque": [[float(str(value)) for value in values] for values in torque[first]],
     }
     how = {name: content[name] for name in ("difficulty", "body", "world")}
-    content |= noted_use(seed, len(episodes), content["weights"], {"program": RERUN, **how})
-    write_report(content, source(), indent=None)
-    print(f"{NAME}: solved the level of seed {seed + first} in {len(torque[first])} steps", flush=True)
+    content |= noted_use(seed, len(episodes), content["weights"], {"program": film.rerun, **how})
+    write_report(content, film.source, indent=None)
+    print(f"{film.name}: solved the level of seed {seed + first} in {len(torque[first])} steps", flush=True)
 
 
-def load() -> dict[str, Any] | None:
+def load(film: Film) -> dict[str, Any] | None:
     """Return the recorded episode, or None if there is none.
 
     Raises:
         ResultError: If the file is not what `record` writes.
     """
-    if not source().exists():
+    if not film.source.exists():
         return None
-    return read_source(source(), ("seed", "difficulty", "weights", "instructions", "torque"), RERUN)
+    return read_source(film.source, ("seed", "difficulty", "weights", "instructions", "torque"), film.rerun)
+
+
+def is_stale(film: Film, episode: dict[str, Any]) -> bool:
+    """Tell whether other modules played in a recorded episode than would now."""
+    now = film.stack.identities()
+    return any(now.get(role, played) != played for role, played in episode["weights"].items())
 
 
 def play(
@@ -116,7 +152,7 @@ def play(
         if step < len(torque):
             world.step(torque[step][None])
     if not world.solved[0]:
-        raise ResultError(f"the world has changed since the film strip's episode was recorded; rerun {RERUN}")
+        raise ResultError("the world has changed since the film strip's episode was recorded; record another")
 
 
 def draw(episode: dict[str, Any], file: Path) -> None:

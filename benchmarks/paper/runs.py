@@ -182,7 +182,8 @@ class Options:
     """Rerun the evaluations behind tables and figures."""
 
     only: tuple[str, ...] = ()
-    """Names of the evaluations to rerun; all of them by default. `film_strip` is the episode of Figure 3."""
+    """Names of the evaluations to rerun; all of them by default. `film_strip` is the episode of Figure 3,
+    `film_strip_ant` one of the ant."""
     episodes: int = EPISODES
     """Levels of an evaluation (paper C.5: 512)."""
     processes: int = 2
@@ -199,7 +200,8 @@ def rerun(options: Options) -> None:
     from benchmarks.paper import baselines, bodies, film, parts
 
     every = (*ALL, *bodies.RUNS, *baselines.RUNS)
-    names = [*(run.name for run in every), film.NAME]
+    films = {kept.name: kept for kept in film.FILMS.values()}
+    names = [*(run.name for run in every), *films]
     unknown = set(options.only) - set(names)
     if unknown:
         raise ValueError(f"--only {', '.join(sorted(unknown))}: expected some of {', '.join(names)}")
@@ -215,8 +217,8 @@ def rerun(options: Options) -> None:
             print(f"{run.name}: measured already with these weights (--again measures anew)", flush=True)
             continue
         parts.evaluate(run, options)
-    if film.NAME in chosen:
-        film.record()
+    for name in films.keys() & set(chosen):
+        film.record(films[name])
 
 
 def main(command_line: Sequence[str] | None = None) -> int:

@@ -87,8 +87,10 @@ def test_a_damaged_source_is_named_with_the_command_that_mends_it(folder):
 
 
 def test_the_film_strip_plays_the_recorded_episode_again(folder):
-    film.record(seed=1000, difficulty=1, stack=ORACLES)
-    episode = film.load()
+    kept = film.Film("strip", ORACLES, difficulty=1, seed=1000)
+    assert film.load(kept) is None
+    film.record(kept)
+    episode = film.load(kept)
     assert [(use["seeds"], use["weights"]) for use in episode["test_uses"]] == [([1000, 1007], episode["weights"])]
     assert episode["body"] == "ball" and episode["world"]
     film.draw(episode, folder / "strip.png")
