@@ -92,7 +92,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "Says where to look before pushing.",
         "The estimate of the abstract state and the cells that have been in view. No camera, no ground truth.",
         f"Trained in a grid model of what a camera sees behind walls. Made for {_GRID_LIMITS}.",
-        "it is asked before each decision, for up to 30 instructions",
+        "it is asked before each decision, for up to 30 instructions; a fixed recursion tells what a turn at each "
+        "place would show, and the way there",
         {"mpo, reward for cells that come into view": "by reward, for cells seen for the first time, by MPO"},
         "estimator",
     ),

@@ -18,15 +18,25 @@ from numpy.typing import NDArray
 from mujoban_core.bodies import BALL
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
 from mujoban_core.look_around import WALKS
-from mujoban_core.viewpoints import TURN_HEADINGS, WALK_HEADINGS
+from mujoban_core.viewpoints import TURN_HEADINGS, WALK_HEADINGS, survey
 from mujoban_core.visibility import cells_in_view
 from mujoban_planner.uncertainty import BORDER, guesses, visible
 from mujoban_rl.engine import State
 
-SHOWN: Final = 4
-"""Channel of the cells that have been in view, behind those of the abstract state."""
-CHANNELS: Final = SHOWN + 1
+SHOWN, GAIN, DISTANCE, FIRST = range(4, 8)
+"""Channels behind those of the abstract state: cells that have been in view, and the `Survey` from the robot's cell."""
+CHANNELS: Final = FIRST + 1
 _CHANGING: Final = ("level", "agent", "seen", "guess", "steps")
+
+
+def observe_estimate(abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return what an explorer is told, [N, N, 8]: an estimate, which cells have been in view, what each cell promises.
+
+    Args:
+        abstract_state: Estimate, [N, N, 4].
+        shown: Cells that have been in view, [N, N].
+    """
+    return np.stack([*np.moveaxis(abstract_state, -1, 0), shown, *survey(abstract_state, shown)], -1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -54,7 +64,7 @@ class ExplorationStep(NamedTuple):
 class ExplorationEnvironment:
     """E levels that are explored.
 
-    Observation: estimate and cells that have been in view, float32 [E, N, N, 5]. Action: STAY (a turn on the spot), a
+    Observation: see `observe_estimate`, float32 [E, N, N, 8]. Action: STAY (a turn on the spot), a
     step north, east, south or west. Reward: see `ExplorationReward`. Every episode begins with a turn. To stop is worth
     nothing and needs no action: whoever expects less of every action stops.
     """
@@ -106,11 +116,12 @@ class ExplorationEnvironment:
         return (visible(self.level) & ~self.seen).sum((1, 2))
 
     def observe(self) -> NDArray[np.float32]:
-        """Return estimates with the cells that have been in view, [E, N, N, 5]."""
+        """Return what an explorer is told of every level, [E, N, N, 8]."""
         state = np.where(self.seen[..., None], self.level, self.guess)
         state[..., AGENT] = 0.0
         state[np.arange(len(state)), self.agent[:, 0], self.agent[:, 1], AGENT] = 1.0
-        return np.concatenate([state, self.seen[..., None]], -1).astype(np.float32)
+        estimates = zip(state.astype(np.float32), self.seen, strict=True)
+        return np.stack([observe_estimate(estimate, shown) for estimate, shown in estimates])
 
     def step(self, action: NDArray[np.int64]) -> ExplorationStep:
         """Execute an action in every level, [E]."""

@@ -2,7 +2,7 @@
 
 It says a step towards a view, a turn on the spot, or that there is nothing more to look for; it pushes nothing.
 
-Shapes: B states, N = `grid.GRID_SIZE`, I = 8 rows and columns of the interior, C channels, A = 5 instructions.
+Shapes: B states, N = `grid.GRID_SIZE`, I = 8 rows and columns of the interior, A = 5 instructions.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
+from mujoban_core.grid import Instruction
 from mujoban_core.look_around import Scout
-from mujoban_core.viewpoints import FREE
-from mujoban_planner.exploration_env import CHANNELS
+from mujoban_planner.exploration_env import DISTANCE, FIRST, observe_estimate
 from mujoban_planner.networks import ResidualBlock
 from mujoban_rl.weights import load_weights
 
 _IMPOSSIBLE: Final = -1e4
-"""Logit of a step into a cell that is not believed to be free."""
-
+"""Logit and value of an instruction that leads to no cell that is believed to be free."""
+_SCALE: Final = (1.0, 1.0, 1.0, 1.0, 1.0, 0.1, 0.1)
+"""Of the channels that the network reads: all but the first step."""
+_PLANES: Final = len(_SCALE)
 
 SHIPPED: Final = Path(__file__).parent / "weights" / "explorer.safetensors"
 """The weights that ship."""
@@ -41,44 +42,41 @@ class ExplorerOutput(NamedTuple):
 
 
 class Explorer(nn.Module, Scout):
-    """Residual network over the board, read out where the robot is."""
+    """Residual network over the board that says what each cell is worth as the next place to turn at.
 
-    offsets: Tensor
+    The way there is walked by rule: an instruction is worth what the best place is to which it is the first step, less
+    a learned cost of every step. What a turn at each place would show is told to the network (`viewpoints.survey`);
+    whether it is worth the way, and where nothing is, it learns.
+    """
 
     def __init__(self, channels: int = 32, blocks: int = 4) -> None:
         """Build the network."""
         super().__init__()
         self.config = {"channels": channels, "blocks": blocks}
-        self.encoder = nn.Conv2d(CHANNELS, channels, 3, padding=1)
+        self.encoder = nn.Conv2d(_PLANES, channels, 3, padding=1)
         self.blocks = nn.Sequential(*(ResidualBlock(channels) for _ in range(blocks)))
-        self.mix = nn.Linear(3 * channels, 2 * channels)
-        self.policy = nn.Linear(2 * channels, len(Instruction))
-        self.q = nn.Linear(2 * channels, len(Instruction))
-        offsets = OFFSETS_RC[:, 0] * GRID_SIZE + OFFSETS_RC[:, 1]
-        self.register_buffer("offsets", torch.from_numpy(offsets[1:].copy()), persistent=False)
+        self.places = nn.Conv2d(channels + _PLANES, len(ExplorerOutput._fields), 1)
+        self.step_cost = nn.Parameter(torch.full((len(ExplorerOutput._fields),), -3.0))
 
     def forward(self, states: Tensor) -> ExplorerOutput:
-        """Return policy and Q-values of states, float32 [B, N, N, 5] (see `ExplorationEnvironment`)."""
-        agent = states[..., AGENT]
-        x = self.blocks(self.encoder(states[:, 1:-1, 1:-1].permute(0, 3, 1, 2)))
-        here = (x * agent[:, None, 1:-1, 1:-1]).sum((2, 3))
-        features = functional.relu(self.mix(torch.cat([here, x.mean((2, 3)), x.amax((2, 3))], 1)))
-        policy = self.policy(features).masked_fill(~self.possible(states), _IMPOSSIBLE)
-        return ExplorerOutput(policy, self.q(features))
-
-    def possible(self, states: Tensor) -> Tensor:
-        """Return which instructions there are: no steps into walls, boxes or the border, bool [B, A]."""
-        free = (states[..., WALL] < FREE) & (states[..., BOX] < FREE)
-        free[:, [0, -1]] = free[:, :, [0, -1]] = False
-        at = states[..., AGENT].flatten(1).argmax(1)
-        moves = free.flatten(1).gather(1, (at[:, None] + self.offsets).clamp(0, GRID_SIZE**2 - 1))
-        return torch.cat([torch.ones_like(moves[:, :1]), moves], 1)
+        """Return policy and Q-values of states, float32 [B, N, N, 8] (see `exploration_env.observe_estimate`)."""
+        inner = states[:, 1:-1, 1:-1]
+        scale = inner.new_tensor(_SCALE)
+        planes = (inner[..., : len(_SCALE)] * scale).permute(0, 3, 1, 2)
+        worth = self.places(torch.cat([self.blocks(self.encoder(planes)), planes], 1))
+        distance, first = inner[..., DISTANCE], inner[..., FIRST]
+        worth = worth - functional.softplus(self.step_cost)[:, None, None] * distance[:, None].clamp(min=0.0)
+        leads = (first[:, None] == torch.arange(len(Instruction), device=states.device)[:, None, None]) & (
+            distance[:, None] >= 0.0
+        )
+        # Shape [B, 2, A, I * I].
+        values = worth[:, :, None].masked_fill(~leads[:, None], _IMPOSSIBLE).flatten(3)
+        return ExplorerOutput(values[:, 0].logsumexp(-1), values[:, 1].amax(-1))
 
     @torch.inference_mode()
     def step(self, abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> Instruction | None:
         """Return the likeliest instruction, None where it is not worth its cost; see `Scout.step`."""
-        state = np.concatenate([abstract_state, shown[..., None]], -1).astype(np.float32)
-        policy, q = self(torch.from_numpy(state)[None])
+        policy, q = self(torch.from_numpy(observe_estimate(abstract_state, shown))[None])
         best = int(policy.argmax())
         return Instruction(best) if q[0, best] > 0.0 else None
 
