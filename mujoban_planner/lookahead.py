@@ -165,10 +165,10 @@ class LookAheadPlanner(Planner):
             self.evaluations += advance(going, self.planner, self.per_tick or self.expansions)
 
     def _revived(self, memory: Memory) -> SearchMemory:
-        """Return the searches of a memory; one that the process before this one did is done again."""
+        """Return the searches of a memory; one that the process before this one did is done again, where time waits."""
         search, start, spent = (np.array(x) for x in memory[_PLAN:_OWN])
         for row in np.flatnonzero(spent > 0).tolist():
-            if search[row] is None:
+            if search[row] is None and not self.deadline:
                 search[row] = LoneSearch(boards_at(start[row]), self.expansions, MOVE_LIMIT)
                 self.evaluations += advance([search[row]], self.planner, int(spent[row]))
         return SearchMemory(search, start, spent)
