@@ -27,7 +27,9 @@ from mujoban_planner.symmetry import SYMMETRIES, view_states
 from mujoban_planner.validation import difficulty_shares, validation_levels
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Trainer
+from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo_discrete import DiscreteMPOConfig
+from mujoban_rl.optimise import ProgressSchedule, warm_up_cosine
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import provenance, save_weights
@@ -58,6 +60,8 @@ class ExplorerConfig(PlayConfig):
     replay_steps: int = 300
     discount: float = 0.97
     learning_rate: float = 1e-3
+    warm_up: float = 0.01
+    """Share of the budget over which the learning rate rises; then it falls to 0."""
     q_weight: float = 5.0
     cpu_seconds: float = 1200.0
     """CPU seconds after which the run is complete."""
@@ -146,6 +150,13 @@ class ExplorerLearner(DiscreteMPOLearner):
         torch.manual_seed(config.seed)  # the initial weights
         super().__init__(config, Explorer(config.channels, config.blocks))
         self._reward = config.reward
+        # What looks are worth differs by little, which a constant rate does not settle.
+        self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up))
+
+    def update(self, batch: MPOBatch, progress: float, guard: NaNGuard) -> dict[str, float]:
+        """Take one gradient step at the rate that this share of the budget has."""
+        self._schedule.follow(progress)
+        return super().update(batch, progress, guard)
 
     def value(self, answer: Answer) -> Tensor:
         """Return what states are worth to one who may stop, [B]."""

@@ -42,10 +42,10 @@ class ExplorerOutput(NamedTuple):
 
 
 class Explorer(nn.Module, Scout):
-    """Residual network over the board that says what each cell is worth as the next place to turn at.
+    """Residual network over the board that says what a turn is worth here, and what going to each other cell.
 
-    The way there is walked by rule: an instruction is worth what the best place is to which it is the first step, less
-    a learned cost of every step. What a turn at each place would show is told to the network (`viewpoints.survey`);
+    The way there is walked by rule: a step is worth what the best place is to which it is the first, less a learned
+    cost of every step. What a turn at each place would show is told to the network (`viewpoints.survey`);
     whether it is worth the way, and where nothing is, it learns.
     """
 
@@ -55,7 +55,7 @@ class Explorer(nn.Module, Scout):
         self.config = {"channels": channels, "blocks": blocks}
         self.encoder = nn.Conv2d(_PLANES, channels, 3, padding=1)
         self.blocks = nn.Sequential(*(ResidualBlock(channels) for _ in range(blocks)))
-        self.places = nn.Conv2d(channels + _PLANES, len(ExplorerOutput._fields), 1)
+        self.places = nn.Conv2d(channels + _PLANES, 2 * len(ExplorerOutput._fields), 1)
         self.step_cost = nn.Parameter(torch.full((len(ExplorerOutput._fields),), -3.0))
 
     def forward(self, states: Tensor) -> ExplorerOutput:
@@ -65,7 +65,9 @@ class Explorer(nn.Module, Scout):
         planes = (inner[..., : len(_SCALE)] * scale).permute(0, 3, 1, 2)
         worth = self.places(torch.cat([self.blocks(self.encoder(planes)), planes], 1))
         distance, first = inner[..., DISTANCE], inner[..., FIRST]
-        worth = worth - functional.softplus(self.step_cost)[:, None, None] * distance[:, None].clamp(min=0.0)
+        here = (distance == 0.0)[:, None]
+        turn, go = worth.chunk(2, 1)
+        worth = torch.where(here, turn, go - functional.softplus(self.step_cost)[:, None, None] * distance[:, None])
         leads = (first[:, None] == torch.arange(len(Instruction), device=states.device)[:, None, None]) & (
             distance[:, None] >= 0.0
         )
