@@ -76,7 +76,8 @@ class Choice:
         path = self.weights or shipped_weights(self.role)
         if not path.is_file():
             raise WeightsError(f"no weights of the {self.role} at {path}: expected a .safetensors file")
-        privileged = self.weights is not None and self.load().privileged
+        # A scout is told the estimate alone; of the others a teacher's weights may be told the truth.
+        privileged = self.role != SCOUT and self.weights is not None and self.load().privileged
         return f"{digest(path)}{PRIVILEGED if privileged else ''}"
 
 
