@@ -123,8 +123,8 @@ class ModuleOptions:
     """What says where to look: scripted, learned, weights of a learned one, or a class of your own."""
 
     look_ahead: Annotated[int | None, whole("N", 0)] = None
-    """Let the learned planner search ahead by N evaluations of its network as the robot moves; 0 for none, its policy
-    alone; by default 400, and 0 for a planner of your own or the oracle."""
+    """Let the learned planner search ahead by N evaluations of its network as the robot moves.
+    0 is its policy alone; by default 400, and none for a planner of your own or the oracle."""
     look_ahead_per_tick: Annotated[int, whole("N")] = PER_TICK
     """Of them, in one tick; in real time as many as fit into a fifth of it."""
     look_ahead_certainty: float = CERTAINTY

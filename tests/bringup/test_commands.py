@@ -27,8 +27,6 @@ from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.bags.training import episode_ticks, open_training_bag
 from mujoban_msgs_py.topics import GRAPH_TOPICS
 from mujoban_planner.deliberation import Deliberation
-from mujoban_planner.explorer import Explorer
-from mujoban_rl.weights import save_weights
 from mujoban_sim import rendering
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import TRAIN_SEEDS
@@ -101,15 +99,6 @@ def test_a_report_says_what_was_played(tmp_path):
     told = played(searching, Episodes(1, 0), EpisodeOptions(body="ant"))
     assert told["look_ahead"] == 400 and told["look_ahead_certainty"] == 0.8
     assert told["look_around"] == ANT.look_ticks and told["time_limit"] == 9600
-
-
-def test_a_learned_scout_plays_and_is_named_by_its_weights(tmp_path):
-    path, weights = tmp_path / "report.json", tmp_path / "explorer.safetensors"
-    explorer = Explorer(8, 1)
-    save_weights(weights, explorer, explorer.config, {})
-    options = ("--difficulty", 1, "--time-limit", 90, "--seed", 5_000_007, "--oracle", "planner,controller,termination")
-    assert run(evaluate, *options, "--scout", weights, "--json", path) == 0
-    assert json.loads(path.read_text())["weights"]["scout"] == digest(weights)
 
 
 def test_a_summary_on_the_terminal_names_lost_seeds_by_cause(capfd):

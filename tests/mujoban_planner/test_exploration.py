@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
 import pytest
 import torch
 
+from bringup import evaluate
+from mujoban_core.files import digest
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
 from mujoban_core.look_around import WALKS, LookAroundPlanner, Scout
 from mujoban_planner.boards import abstract_states
@@ -16,6 +19,7 @@ from mujoban_planner.exploration_mpo import ExplorerConfig, explore, judge_scout
 from mujoban_planner.explorer import Explorer
 from mujoban_planner.uncertainty import visible
 from mujoban_rl.testing import check_refusal, check_resuming
+from mujoban_rl.weights import save_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sokoban.levels import Level, stack_levels
 
@@ -129,3 +133,13 @@ def test_looking_pays_where_it_is_rewarded(monkeypatch):
     # Whoever never stops is stopped, also where all has been seen.
     monkeypatch.setattr(ExplorationEnvironment, "remaining", property(lambda self: np.zeros(4, np.int64)))
     assert judge_scout(Turns(), reward, 4)["looks"] == WALKS
+
+
+def test_a_learned_scout_plays_and_is_named_by_its_weights(tmp_path):
+    path, weights = tmp_path / "report.json", tmp_path / "explorer.safetensors"
+    explorer = Explorer(8, 1)
+    save_weights(weights, explorer, explorer.config, {})
+    options = ["--difficulty", "1", "--time-limit", "90", "--seed", "5000007"]
+    oracles = ["--oracle", "planner,controller,termination"]
+    assert evaluate.main([*options, *oracles, "--scout", str(weights), "--json", str(path)]) == 0
+    assert json.loads(path.read_text())["weights"]["scout"] == digest(weights)
