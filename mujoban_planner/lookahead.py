@@ -179,7 +179,8 @@ class LookAheadPlanner(Planner):
             here = BitBoards._make(column[row : row + 1] for column in boards)
             search: Any = searches.search[row]
             if search is None or not search.concerns(here):
-                searches.search[row] = LoneSearch(here, self.expansions, MOVE_LIMIT)
+                searches.search[row] = begun = LoneSearch(here, self.expansions, MOVE_LIMIT)
+                searches.start[row] = begun.origin
         self._advance(searches.search[rows])
 
     def _is_certain(
@@ -208,11 +209,9 @@ class LookAheadPlanner(Planner):
 
 
 def _noted(searches: SearchMemory) -> SearchMemory:
-    """Return the memory of searches with where each began and how far it is."""
-    start, spent = searches.start, searches.spent
-    for row, search in enumerate(searches.search):
-        start[row], spent[row] = (0, 0) if search is None else (search.origin, search.spent)
-    return SearchMemory(searches.search, start, spent)
+    """Return the memory of searches with how far each is."""
+    spent = [0 if search is None else search.spent for search in searches.search]
+    return searches._replace(spent=np.array(spent, np.int64))
 
 
 def _searching(searches: NDArray[Any]) -> NDArray[np.bool_]:

@@ -218,8 +218,9 @@ def rerun(options: Options) -> None:
             print(f"{run.name}: measured already with these weights (--again measures anew)", flush=True)
             continue
         parts.evaluate(run, options)
-    for name in films.keys() & set(chosen):
-        film.record(films[name])
+    for name, kept in films.items():
+        if name in chosen:
+            film.record(kept)
 
 
 def main(command_line: Sequence[str] | None = None) -> int:
