@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_core.grid import Instruction
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError
 from mujoban_msgs_py.bags.training import EpisodeTick, episode_ticks, find_bags, open_training_bag
@@ -37,6 +38,8 @@ class Decision(NamedTuple):
     """Abstract state as it was, [N, N, 4]."""
     estimate: NDArray[np.float32]
     """As the estimator gave it, [N, N, 4]."""
+    instruction: Instruction
+    """What was decided."""
 
 
 def decisions(ticks: Iterable[EpisodeTick]) -> Iterator[Decision]:
@@ -51,7 +54,7 @@ def decisions(ticks: Iterable[EpisodeTick]) -> Iterator[Decision]:
             sequence = 0
         if instruction.sequence != sequence:
             sequence = instruction.sequence
-            yield Decision(truth, estimate)
+            yield Decision(truth, estimate, Instruction(instruction.direction))
 
 
 class Lessons(NamedTuple):
@@ -64,15 +67,21 @@ class Lessons(NamedTuple):
     """Whether there is an estimate, [S]; the others are states that a wrong push would have led to."""
 
     @classmethod
-    def read(cls, bags: Sequence[Path], seed: int) -> Lessons:
+    def read(cls, bags: Sequence[Path], seed: int, *, stays: bool = True) -> Lessons:
         """Read and label the decisions of bags, or of folders of bags.
+
+        Args:
+            bags: What is read.
+            seed: Of the solver's choice among ways that are equally short.
+            stays: Take those to stay as well; most of these are ticks of a look, in which no planner chose anything.
 
         Raises:
             BagError: If a bag is damaged, lacks a topic or holds a level that is not for training, or none holds a
                 decision that the solver can label.
         """
         opened = [open_training_bag(bag, _TOPICS) for bag in find_bags(bags)]
-        found = [decision for bag in opened for decision in decisions(episode_ticks(bag, _TOPICS))]
+        made = (decision for bag in opened for decision in decisions(episode_ticks(bag, _TOPICS)))
+        found = [decision for decision in made if stays or decision.instruction != Instruction.STAY]
         if not found:
             raise BagError(f"{', '.join(map(str, bags))}: no instruction, expected bags of played episodes")
         boards = likeliest_boards(np.stack([decision.truth for decision in found]))

@@ -42,6 +42,8 @@ PROG = "mujoban_planner.calibration"
 _BINS: Final = 10
 _CHUNK: Final = 512
 """States in one forward pass."""
+_AREA: Final = 5.0
+"""Of a point, for each factor e of the pushes behind it."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Options:
     """Draw how often pushes are deadly against how probable the planner calls that."""
 
     bags: tuple[Path, ...] = ()
-    """Recorded bags, or folders of bags, whose decisions are judged as they were estimated."""
+    """Recorded bags, or folders of bags, whose decisions to move are judged as they were estimated."""
     episodes: int = 500
     """Validation levels whose solutions are judged as they are."""
     difficulty: int = 5
@@ -112,16 +114,17 @@ def reliability(found: Verdicts) -> dict[str, Any]:
 
 
 def draw(curves: Mapping[str, Mapping[str, Any]], out: Path) -> None:
-    """Draw the diagram, one curve for each kind of state."""
-    figure, axis = plt.subplots(figsize=(4.6, 4.2))
+    """Draw the diagram, one curve for each kind of state; the more pushes stand behind a point, the larger it is."""
+    figure, axis = plt.subplots(figsize=(4.6, 4.8))
     axis.plot([0.0, 1.0], [0.0, 1.0], "--", color="grey", linewidth=1, label="as often as said")
     for name, curve in curves.items():
         label = f"{name} ({curve['pushes']:,} pushes)"
-        axis.plot(curve["said"], curve["is"], "o-", label=label)
+        (line,) = axis.plot(curve["said"], curve["is"], linewidth=1, label=label)
+        axis.scatter(curve["said"], curve["is"], _AREA * np.log1p(curve["n"]), color=line.get_color(), clip_on=False)
     axis.set(xlabel="probability that the push is deadly, by the planner", ylabel="share of these pushes that are")
     axis.set(xlim=(0, 1), ylim=(0, 1))
     axis.grid(alpha=0.3)
-    axis.legend(fontsize="small", loc="upper left")
+    axis.legend(fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     figure.tight_layout()
     figure.savefig(out, dpi=110)
     plt.close(figure)
@@ -134,12 +137,12 @@ def main(command_line: Sequence[str] | None = None) -> int:
         check_file(name, file)
     planner = load(options.weights, compiled=False)
     levels = validation_levels(options.difficulty, options.episodes)
-    curves = {"as it is": reliability(verdicts(planner, Teacher().demonstrate(levels, np.random.default_rng(0))))}
+    curves = {"levels, as they are": reliability(verdicts(planner, Teacher().demonstrate(levels, np.random.default_rng(0))))}
     if options.bags:
-        lessons = Lessons.read(options.bags, 0)
+        lessons = Lessons.read(options.bags, 0, stays=False)
         shown = lessons.samples.take(lessons.estimated)
-        curves["as estimated"] = reliability(verdicts(planner, shown, lessons.estimates[lessons.estimated]))
-        curves["the same states as they are"] = reliability(verdicts(planner, shown))
+        curves["decisions, as estimated"] = reliability(verdicts(planner, shown, lessons.estimates[lessons.estimated]))
+        curves["the same decisions, as it was"] = reliability(verdicts(planner, shown))
     draw(curves, options.out)
     for name, curve in curves.items():
         print(f"{name}: {curve['pushes']} pushes, {curve['dead']:.1%} dead, off by {curve['calibration_error']:.2%}")

@@ -18,8 +18,8 @@ from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
 from mujoban_sokoban.solver import solve_level
 
 
-def play_and_record(path, seed):
-    stack = Stack({role: Choice(role, "oracle") for role in ROLES})
+def play_and_record(path, seed, look_around=0):
+    stack = Stack({role: Choice(role, "oracle") for role in ROLES}, look_around=look_around)
     assert record(Job(path, "", MixedEpisodes(1, seed, [1]), stack, None, 1, 400, 0))
 
 
@@ -42,6 +42,13 @@ def test_decisions_are_labelled_by_the_truth_and_shown_as_they_were_estimated(ba
     torch.testing.assert_close(as_estimated.state, 0.75 * as_it_was.state)
     assert torch.equal(as_estimated.right, as_it_was.right) and bool(as_it_was.right.any(1).all())
     assert len(as_it_was.state.unique(dim=0)) > shown.sum()  # the board is turned as well
+
+
+def test_looking_around_counts_as_decisions_only_where_stays_are_asked_for(tmp_path):
+    play_and_record(tmp_path, TRAIN_SEEDS.start, look_around=12)
+    every, moves = (Lessons.read([tmp_path], 0, stays=stays).estimated.sum() for stays in (True, False))
+    assert moves == len(solve_level(generate_level(1, TRAIN_SEEDS.start)).moves)
+    assert every > moves
 
 
 def test_levels_that_are_kept_for_tests_are_refused(tmp_path):

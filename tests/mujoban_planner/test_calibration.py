@@ -34,4 +34,4 @@ def test_the_command_draws_and_reports(tmp_path):
     image, report = tmp_path / "calibration.png", tmp_path / "calibration.json"
     assert main(["--episodes", "6", "--difficulty", "2", "--out", str(image), "--json", str(report)]) == 0
     assert image.stat().st_size > 5_000
-    assert json.loads(report.read_text())["as it is"]["pushes"] > 10
+    assert json.loads(report.read_text())["levels, as they are"]["pushes"] > 10
