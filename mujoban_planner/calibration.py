@@ -136,8 +136,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
     for name, file in (("--out", options.out), ("--json", options.json)):
         check_file(name, file)
     planner = load(options.weights, compiled=False)
-    levels = validation_levels(options.difficulty, options.episodes)
-    curves = {"levels, as they are": reliability(verdicts(planner, Teacher().demonstrate(levels, np.random.default_rng(0))))}
+    levels = Teacher().demonstrate(validation_levels(options.difficulty, options.episodes), np.random.default_rng(0))
+    curves = {"levels, as they are": reliability(verdicts(planner, levels))}
     if options.bags:
         lessons = Lessons.read(options.bags, 0, stays=False)
         shown = lessons.samples.take(lessons.estimated)
