@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_sim.meshes import BANDS, SKYLINE_HEIGHTS, SKYLINE_V
+from mujoban_sim.meshes import BANDS, SKYLINE_HEIGHTS, SKYLINE_ROWS, SKYLINE_V
 
 Image = NDArray[np.uint8]
 Pattern = NDArray[np.float64]
@@ -34,7 +34,7 @@ PRESSED_TARGET_COLOUR: Final = (0.05, 0.80, 0.10)
 _CELL_PIXELS: Final = 128
 _GUTTER: Final = 8
 """Rows by which a band goes on periodically on either side, so that filtering does not mix bands."""
-SKYLINE_SHAPE: Final = (128, 2048, 3)
+SKYLINE_SHAPE: Final = (SKYLINE_ROWS, 2048, 3)
 """Rows, columns and channels of the skyline's texture."""
 
 _APPEARANCE_STREAM: Final = 0x41505052

@@ -23,12 +23,18 @@ BANDS: Final = ("side", "top", "floor", "peg")
 MAX_QUADS: Final = GRID_SIZE**2 + 2 * GRID_SIZE * (GRID_SIZE - 1) + 5 * (GRID_SIZE - 1) ** 2
 """Quads that a level can need: a floor or top per cell, a side per inner edge, five per inner corner's peg."""
 
+SKYLINE_ROWS: Final = 128
+"""Rows of the skyline's texture."""
 SKYLINE_RADIUS: Final = 60.0
 """Radius of the skyline's ring in cells."""
 SKYLINE_HEIGHTS: Final = (-0.36, 0.0, 0.32, 0.85)
 """Heights of its rings as tangents of the elevation: ground, horizon, top of the buildings, sky."""
 SKYLINE_V: Final = (0.0, 0.125, 0.875, 1.0)
 """Texture coordinate v at those heights: buildings get most of the texture."""
+_SKY_TOP: Final = 3.0
+"""Tangent of the elevation up to which there is sky: a robot that leans back sees higher than the skyline's texture."""
+_SKY_V: Final = 1.0 - 0.5 / SKYLINE_ROWS
+"""The middle of the texture's last row: its edge would show half of the first one, the ground."""
 _SKYLINE_SEGMENTS: Final = 16
 
 
@@ -167,15 +173,16 @@ def level_mesh(
 
 
 def skyline_mesh(cell_size: float) -> Mesh:
-    """Return the ring that carries the skyline, seen from inside; u runs once around it, from east by north."""
+    """Return the rings that carry the skyline, seen from inside; u runs once around them, from east by north."""
     radius = SKYLINE_RADIUS * cell_size
+    heights = (*SKYLINE_HEIGHTS, SKYLINE_HEIGHTS[-1], _SKY_TOP)
     angle = np.linspace(0.0, 2 * np.pi, _SKYLINE_SEGMENTS + 1)
     # Shape [rings, segments + 1].
-    x = np.broadcast_to(radius * np.cos(angle), (len(SKYLINE_HEIGHTS), len(angle)))
+    x = np.broadcast_to(radius * np.cos(angle), (len(heights), len(angle)))
     y = np.broadcast_to(radius * np.sin(angle), x.shape)
-    z = np.broadcast_to(radius * np.array(SKYLINE_HEIGHTS)[:, None], x.shape)
+    z = np.broadcast_to(radius * np.array(heights)[:, None], x.shape)
     u = np.broadcast_to(angle / (2 * np.pi), x.shape)
-    v = np.broadcast_to(np.array(SKYLINE_V)[:, None], x.shape)
+    v = np.broadcast_to(np.array((*SKYLINE_V, _SKY_V, _SKY_V))[:, None], x.shape)
     vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     normals = np.stack([-x / radius, -y / radius, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     index = np.arange(x.size).reshape(x.shape)
