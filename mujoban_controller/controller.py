@@ -54,7 +54,7 @@ class Recurrent(NamedTuple):
     cell: Tensor
     """LSTM cell, [B, H]."""
     track: Tensor
-    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading needle (2) and side ahead (1) follow."""
+    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading needle (4) and side ahead (1) follow."""
 
 
 def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
@@ -96,7 +96,7 @@ class ControllerOutput(NamedTuple):
     features: Tensor
     """What the action rests on, [B, T, H + F]; auxiliary losses attach here."""
     shown: Tensor | None
-    """What each frame shows of the heading, [B, T, 2]; None for a body that feels it."""
+    """What each frame shows of the heading, [B, T, `SIGHT`]; None for a body that feels it."""
     heading: Tensor | None
     """Unit vectors in which the robots face as far as is known, [B, T, 2]; None for a body that feels it."""
     memory: Recurrent
@@ -147,7 +147,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         self.compass = Compass(layout, features) if self.heading_index is None else None
         # Where the heading is felt, joint positions are replaced by two sine-cosine pairs; else it is told, and the
         # side ahead, one-hot as A is. Beta is one bit.
-        angles = 3 * self.joints if self.compass is None else NEEDLE + self.sides.count
+        angles = 3 * self.joints if self.compass is None else 2 + self.sides.count
         inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1
         shrink = 2 ** (len(channels) - 1)
         # Who does not feel the heading has to look at the skyline.
@@ -190,14 +190,14 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
     def reckon(
         self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor, shown: Tensor | None
     ) -> Tensor:
-        """Return the track after one more tick, [B, 7 or 10].
+        """Return the track after one more tick, [B, 7 or 12].
 
         Args:
             proprio: o_pr, [B, P].
             instruction: A, int64 [B].
             terminated: beta, bool [B].
             track: Before the tick; zeros at an episode's start.
-            shown: What the frame shows of the heading, [B, 2]; None for a body that feels it.
+            shown: What the frame shows of the heading, [B, `SIGHT`]; None for a body that feels it.
         """
         velocity = proprio[:, self.part.planar_velocity] / self.cell_size
         before = track[:, :_TRACK]
@@ -228,7 +228,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             proprio: o_pr, [M, P].
             instruction: A, int64 [M].
             terminated: beta, bool [M].
-            track: Dead reckoning and what goes with it, [M, 7 or 10].
+            track: Dead reckoning and what goes with it, [M, 7 or 12].
         """
         part = self.part
         # Shape [M, 1] each.
@@ -273,7 +273,9 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         keep = torch.ones_like(proprio[..., :1]) if first is None else (~first[..., None]).to(proprio.dtype)
         h, c, track = memory
         seen = self.encode(frame.flatten(0, 1))
-        shown = None if self.compass is None else self.compass.read(seen).view(b, t, -1)
+        shown = None
+        if self.compass is not None:
+            shown = self.compass.read(frame.flatten(0, 1), seen, proprio.flatten(0, 1)).view(b, t, -1)
         tracks = []
         for i in range(t):
             past, sight = track * keep[:, i], None if shown is None else shown[:, i]

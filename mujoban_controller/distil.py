@@ -22,8 +22,10 @@ from mujoban_controller.controller import INPUT_FIELDS, ControllerOutput, Visuom
 from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask
+from mujoban_controller.orientation import sight_loss
 from mujoban_controller.play import Batch, CameraPlayer, Fields, put_on
 from mujoban_controller.product import ProductLearner, Validation
+from mujoban_controller.skyline import unit
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
@@ -69,7 +71,7 @@ class DistilConfig:
     goal_weight: float = 0.5
     kind_weight: float = 0.05
     heading_weight: float = 1.0
-    """Weight of the heading that is read from the skyline, for a body that does not feel its own."""
+    """Weight of what frames show of the heading, for a body that does not feel its own."""
     infeasible_weight: float = 1.0
     """Weight of the torques under an instruction towards a wall or a blocked box. Below 1, a student in doubt whether
     a push is possible tries it: the loss is nearly absolute, so it acts from this share of the odds on."""
@@ -123,10 +125,8 @@ def imitation_loss(
     loss = action + 0.01 * spread + config.goal_weight * goal + config.kind_weight * kind
     stats = {}
     if output.shown is not None and output.heading is not None:
-        truth = torch.stack([batch["heading"].cos(), batch["heading"].sin()], -1)
-        # Squares make it the mean of what may be: short where a frame shows little.
-        loss = loss + config.heading_weight * functional.mse_loss(output.shown, truth)
-        off = (output.heading * truth).sum(-1).clamp(-1.0, 1.0).acos()
+        loss = loss + config.heading_weight * sight_loss(output.shown, batch["heading"])
+        off = (output.heading * unit(batch["heading"])).sum(-1).clamp(-1.0, 1.0).acos()
         stats["error/heading_degrees"] = off.rad2deg().median()
     stats |= {
         "loss/action": action,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_features import side_ahead
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import GoalTask
-from mujoban_controller.orientation import Compass, Sides, heading_of
+from mujoban_controller.orientation import NEEDLE, SIGHT, Compass, Sides, heading_of
+from mujoban_controller.skyline import HEADINGS, Skyline, heading_loss, mean_of, unit
 from mujoban_core.bodies import ANT, BALL
+from mujoban_core.camera import project
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
 from mujoban_sim.goals import GoalKind
@@ -36,16 +39,84 @@ def _turning(rate: float, lean: float = 0.0) -> torch.Tensor:
     return proprio
 
 
+def _sight(skyline: float | None = None, lines: float | None = None) -> torch.Tensor:
+    """Return what a frame shows that tells headings in degrees by the skyline and by the lines, or is blind."""
+    sight = torch.zeros(1, SIGHT)
+    if skyline is not None:
+        sight[0, round(skyline / 360 * HEADINGS) % HEADINGS] = 12.0
+    if lines is not None:
+        sight[0, HEADINGS:] = unit(torch.tensor(4 * math.radians(lines)))
+    return sight
+
+
+@torch.no_grad()
 def test_a_needle_goes_with_turns_and_comes_round_to_what_is_seen() -> None:
-    compass, blind = Compass(ANT, 8), torch.zeros(1, 2)
-    with torch.no_grad():
-        needle = compass(torch.tensor([[1.0, 0.0]]), _turning(0.0), blind)
-        for _ in range(20):  # a quarter turn to the left in a second
-            needle = compass(blind, _turning(0.5 * math.pi, lean=0.3), needle)
-        assert _facing(needle) == pytest.approx(90.0, abs=0.1)
-        for _ in range(20):
-            needle = compass(torch.tensor([[-1.0, 0.0]]), _turning(0.0), needle)
+    compass, needle = Compass(ANT, 8), torch.zeros(1, NEEDLE)
+    needle = compass(_sight(0.0, 0.0), _turning(0.0), needle)
+    for _ in range(20):  # a quarter turn to the left in a second
+        needle = compass(_sight(), _turning(0.5 * math.pi, lean=0.3), needle)
+    assert _facing(needle) == pytest.approx(90.0, abs=0.1)
+    for _ in range(20):
+        needle = compass(_sight(180.0, 180.0), _turning(0.0), needle)
     assert abs(_facing(needle)) == pytest.approx(180.0, abs=3.0)
+
+
+@torch.no_grad()
+def test_lines_tell_the_heading_within_the_quarter_that_the_skyline_told_once() -> None:
+    compass = Compass(ANT, 8)
+    needle = compass(_sight(270.0, 264.0), _turning(0.0), torch.zeros(1, NEEDLE))
+    assert _facing(needle) == pytest.approx(-96.0, abs=0.1)
+    # Behind walls for ten seconds, while the gyro strays by a degree in each tick.
+    for _ in range(200):
+        needle = compass(_sight(lines=264.0), _turning(math.radians(1.0) / 0.05), needle)
+    assert _facing(needle) == pytest.approx(-96.0, abs=10.0)
+
+
+@torch.no_grad()
+def test_a_blind_frame_counts_for_little_beside_one_that_shows_the_skyline() -> None:
+    compass = Compass(ANT, 8)
+    needle = compass(_sight(90.0, 90.0), _turning(0.0), torch.zeros(1, NEEDLE))
+    vague = _sight(lines=90.0)
+    vague[0, :HEADINGS] = 0.3 * torch.cos(torch.arange(HEADINGS) * math.tau / HEADINGS + math.pi / 2)
+    assert mean_of(vague[0, :HEADINGS])[1] < -0.1  # it rather looks the other way
+    for _ in range(20):
+        needle = compass(vague, _turning(0.0), needle)
+    assert _facing(needle) == pytest.approx(90.0, abs=1.0)
+
+
+UPRIGHT = torch.tensor([[0.0, 0.0, 1.0]])
+
+
+def test_a_strip_is_laid_out_by_direction() -> None:
+    skyline = Skyline(ANT.camera)
+    # Each pixel's place stands in its colours.
+    rows, columns = np.mgrid[:64, :64].astype(np.float32)
+    frame = torch.from_numpy(np.stack([columns, rows, np.full_like(rows, 255.0)], -1))[None]
+    u, v, inside = 255.0 * (skyline.strip(frame, UPRIGHT)[0] + 0.5)
+    azimuth, elevation = skyline.azimuth.numpy(), skyline.elevation.numpy()[:, None]
+    far = 1e6 * np.stack(np.broadcast_arrays(np.cos(azimuth), np.sin(azimuth), elevation), -1)
+    pixels = project(far.reshape(-1, 3), np.zeros(3), ANT.camera).pixels.reshape(*u.shape, 2)
+    shown = inside.numpy() > 254.0
+    assert shown[:, 4:-4].all() and not shown[:, [0, -1]].all()
+    np.testing.assert_allclose(np.stack([u, v], -1)[shown], pixels[shown], atol=0.01)
+
+
+def test_a_robot_that_leans_sees_the_same_around_the_horizon() -> None:
+    frame = torch.rand(1, 64, 64, 3, generator=torch.Generator().manual_seed(0)) * 255.0
+    for lean in (-0.1, 0.15):  # to the front, which is as if the camera hung lower
+        leaning = torch.tensor([[-math.sin(lean), 0.0, math.cos(lean)]])
+        lower = replace(ANT.camera, pitch=ANT.camera.pitch + lean)
+        torch.testing.assert_close(Skyline(ANT.camera).strip(frame, leaning), Skyline(lower).strip(frame, UPRIGHT))
+
+
+def test_the_loss_of_the_skyline_is_least_where_logits_point_in_the_heading() -> None:
+    heading = torch.tensor([0.0, 1.0, -2.5, 6.2])
+    headings = torch.arange(HEADINGS) * (math.tau / HEADINGS)
+    degrees = [-90.0, -5.0, -1.0, 0.0, 1.0, 5.0, 90.0]
+    logits = [400.0 * torch.cos(headings - heading[:, None] - math.radians(off)) for off in degrees]
+    losses = [float(heading_loss(x, heading)) for x in logits]
+    assert int(np.argmin(losses)) == 3
+    torch.testing.assert_close(mean_of(logits[3]), unit(heading), atol=0.01, rtol=0.0)
 
 
 def test_sides_are_those_of_the_goal_task() -> None:
@@ -81,23 +152,20 @@ def test_an_ant_that_stands_otherwise_does_the_same_for_an_instruction_turned_as
     torques = []
     with torch.no_grad():
         controller.body_encoder[0].weight[:, -6:-1] = 0.0  # the instruction itself
-    for instruction, shown in ((Instruction.EAST, (1.0, 0.0)), (Instruction.NORTH, (0.0, 1.0))):
-        with torch.no_grad():
-            controller.compass.read.weight.zero_()
-            controller.compass.read.bias.copy_(torch.tensor(shown))
+    for instruction, shown in ((Instruction.EAST, 0.0), (Instruction.NORTH, 90.0)):
+        controller.compass.read = lambda *seen, shown=shown: _sight(shown, shown)
         inputs = ControllerInput(np.array([int(instruction)]), frame, proprio, np.array([True]), None)
         torque, memory = controller.step(inputs, controller.initial_memory(1))
         assert controller.side_ahead(memory).tolist() == [0]
         torques.append(torque)
     np.testing.assert_allclose(torques[0], torques[1], atol=1e-6)
     # It need not turn round for what lies behind it.
-    with torch.no_grad():
-        controller.compass.read.bias.copy_(torch.tensor((0.0, -1.0)))
+    controller.compass.read = lambda *seen: _sight(270.0, 270.0)
     _, memory = controller.step(inputs, controller.initial_memory(1))
     assert controller.side_ahead(memory).tolist() == [2]
 
 
-def test_the_skyline_counts_in_the_loss_of_distillation_and_teaches_the_compass() -> None:
+def test_the_heading_counts_in_the_loss_of_distillation_and_teaches_the_compass() -> None:
     controller, config = VisuomotorController("ant", (8, 8), 8, 8), DistilConfig()
     m, w = 3, 4
     output = controller(
@@ -111,7 +179,7 @@ def test_the_skyline_counts_in_the_loss_of_distillation_and_teaches_the_compass(
     }  # fmt: skip
     loss, statistics = imitation_loss(output, GoalHead(16), batch, config)
     loss.backward()
-    assert controller.compass is not None and controller.compass.read.weight.grad is not None
-    assert controller.compass.read.weight.grad.isfinite().all()
-    assert controller.compass.read.weight.grad.abs().sum() > 0
+    assert controller.compass is not None
+    for weights in (controller.compass.lines.weight, controller.compass.skyline.panorama):
+        assert weights.grad is not None and weights.grad.isfinite().all() and weights.grad.abs().sum() > 0
     assert 0.0 <= float(statistics["error/heading_degrees"]) <= 180.0
