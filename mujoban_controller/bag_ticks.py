@@ -113,7 +113,7 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
         "truncated": (discount == 0.0) & ~failed,
         "goal": goal_offsets(view)[:-1],
         "kind": goals.kind[:-1].copy(),
-        "heading": view.pose[:-1, 2].copy(),
+        "pose": view.pose[:-1].astype(np.float32),
     }
     return {name: values[: last + 1] for name, values in fields.items()}
 

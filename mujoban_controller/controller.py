@@ -9,9 +9,10 @@ heading, this says at once by how much to turn. A body that does not feel its he
 skyline say of it instead, and feels and acts as the side sees it that it puts ahead (`orientation`).
 
 It is also given dead reckoning: how far the robot has come since the instruction began, which is the sum of the
-velocities that it feels. The sum is part of the memory, beside the LSTM's; A, o_pr and beta are all it takes.
+velocities that it feels. The sum is part of the memory, beside the LSTM's; A, o_pr and beta are all it takes. Where the
+robot is within its cell stands in the memory too (`place`).
 
-Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators, F features, H memory units.
+Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators, F features, H memory units, D of a track.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from torch.nn import functional
 from mujoban_controller.drivers import ControllerDriver, Driver
 from mujoban_controller.goal_features import AWAY
 from mujoban_controller.orientation import NEEDLE, Compass, Sides, heading_of
+from mujoban_controller.place import PLACE, Place, phases_along
 from mujoban_controller.policy import GoalPolicy
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
@@ -54,7 +56,8 @@ class Recurrent(NamedTuple):
     cell: Tensor
     """LSTM cell, [B, H]."""
     track: Tensor
-    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading needle (4) and side ahead (1) follow."""
+    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading needle (4) and side ahead (1) follow, and
+    with `place` its needles (4)."""
 
 
 def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
@@ -88,6 +91,23 @@ def dead_reckoning(track: Tensor, velocity: Tensor, heading: Tensor, terminated:
     return torch.cat([moved, before, now, torch.ones_like(known)], -1)
 
 
+class Sight(NamedTuple):
+    """What frames show of the robot's pose."""
+
+    heading: Tensor | None
+    """[..., `SIGHT`]; None for a body that feels it."""
+    place: Tensor | None
+    """Phases within the cell, [..., `PLACE`]; None for a network that has no `place`."""
+
+    def over(self, batch: int, ticks: int) -> Sight:
+        """Return what M = B T frames show as sequences, [B, T, ...]."""
+        return Sight(*(x if x is None else x.view(batch, ticks, -1) for x in self))
+
+    def at(self, tick: int) -> Sight:
+        """Return what the frames of a tick show, [B, ...]."""
+        return Sight(*(x if x is None else x[:, tick] for x in self))
+
+
 class ControllerOutput(NamedTuple):
     """Result of `VisuomotorController.forward`."""
 
@@ -95,10 +115,12 @@ class ControllerOutput(NamedTuple):
     """Distribution over torques; mean and scale [B, T, U]."""
     features: Tensor
     """What the action rests on, [B, T, H + F]; auxiliary losses attach here."""
-    shown: Tensor | None
-    """What each frame shows of the heading, [B, T, `SIGHT`]; None for a body that feels it."""
+    shown: Sight
+    """What each frame shows, [B, T, ...]."""
     heading: Tensor | None
     """Unit vectors in which the robots face as far as is known, [B, T, 2]; None for a body that feels it."""
+    place: Tensor | None
+    """The needles of `place`, [B, T, `PLACE`], if there are any."""
     memory: Recurrent
     """Memory after the last tick."""
 
@@ -120,6 +142,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         channels: Sequence[int] = (24, 32, 48, 64),
         features: int = 256,
         hidden: int = 192,
+        place: bool = False,
     ) -> None:
         """Build the network for a body.
 
@@ -128,13 +151,16 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             channels: Width of the stem and of each residual block.
             features: F, width of the fully connected layers.
             hidden: H, width of the LSTM.
+            place: Keep where the robot is within its cell. Weights without a word about it do not.
 
         Raises:
             ValueError: If the body is unknown, or the widths are not what `frame_encoder` takes.
         """
         super().__init__()
         layout = get_body(body)
-        self.config = {"body": body, "channels": list(channels), "features": features, "hidden": hidden}
+        self.config = {
+            "body": body, "channels": list(channels), "features": features, "hidden": hidden, "place": place,
+        }  # fmt: skip
         self.body = body
         self.mixed_precision = False
         """Whether the ResNet may compute in bfloat16: in training, not on the robot, so that runs repeat exactly."""
@@ -145,10 +171,11 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         self.cell_size = layout.cell_size
         self.sides = Sides(layout)
         self.compass = Compass(layout, features) if self.heading_index is None else None
+        self.place = Place(features) if place else None
         # Where the heading is felt, joint positions are replaced by two sine-cosine pairs; else it is told, and the
         # side ahead, one-hot as A is. Beta is one bit.
         angles = 3 * self.joints if self.compass is None else 2 + self.sides.count
-        inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1
+        inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1 + PLACE * place
         shrink = 2 ** (len(channels) - 1)
         # Who does not feel the heading has to look at the skyline.
         self.first_row = rows_of_sky(layout.camera, shrink) if self.compass is None else 0
@@ -187,32 +214,42 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         seen, dtype = frame[:, self.first_row :], self.mean.weight.dtype
         return encode_frames(self.encoder, seen, dtype, mixed_precision=self.mixed_precision)
 
+    def read(self, frame: Tensor, features: Tensor, proprio: Tensor) -> Sight:
+        """Return what frames [M, 64, 64, 3] with features [M, F] show; o_pr is [M, P]."""
+        heading = None if self.compass is None else self.compass.read(frame, features, proprio)
+        return Sight(heading, None if self.place is None else self.place.read(features))
+
     def reckon(
-        self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor, shown: Tensor | None
+        self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor, shown: Sight
     ) -> Tensor:
-        """Return the track after one more tick, [B, 7 or 12].
+        """Return the track after one more tick, [B, D].
 
         Args:
             proprio: o_pr, [B, P].
             instruction: A, int64 [B].
             terminated: beta, bool [B].
             track: Before the tick; zeros at an episode's start.
-            shown: What the frame shows of the heading, [B, `SIGHT`]; None for a body that feels it.
+            shown: What the frame shows.
         """
         velocity = proprio[:, self.part.planar_velocity] / self.cell_size
         before = track[:, :_TRACK]
-        if self.compass is None or shown is None:
+        if self.compass is None or shown.heading is None:
             angle = proprio[:, self.heading_index]
-            heading = torch.stack([angle.cos(), angle.sin()], -1)
-            return dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
-        needle = self.compass(shown, proprio, track[:, _TRACK:_SIDE])
-        heading, side = heading_of(needle), track[:, _SIDE].long()
-        # Chosen for each instruction; and anew where the robot turned, or was mistaken about its heading.
-        away = self.sides.relative(heading, instruction, side)[:, 0] < AWAY
-        new = terminated | (before[:, -1] == 0) | away
-        side = torch.where(new, self.sides.ahead(heading, instruction), side)
-        place = dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
-        return torch.cat([place, needle, side[:, None].to(place.dtype)], -1)
+            heading, facing = torch.stack([angle.cos(), angle.sin()], -1), []
+        else:
+            needle = self.compass(shown.heading, proprio, track[:, _TRACK:_SIDE])
+            heading, side = heading_of(needle), track[:, _SIDE].long()
+            # Chosen for each instruction; and anew where the robot turned, or was mistaken about its heading.
+            away = self.sides.relative(heading, instruction, side)[:, 0] < AWAY
+            new = terminated | (before[:, -1] == 0) | away
+            side = torch.where(new, self.sides.ahead(heading, instruction), side)
+            facing = [needle, side[:, None].to(needle.dtype)]
+        reckoned = dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
+        parts = [reckoned, *facing]
+        if self.place is not None and shown.place is not None:
+            moved = 0.5 * CONTROL_PERIOD * (reckoned[:, 4:6] + before[:, 4:6]) * before[:, 6:]
+            parts.append(self.place(shown.place, heading, moved, track[:, -PLACE:]))
+        return torch.cat(parts, -1)
 
     def side_ahead(self, memory: Memory) -> Tensor:
         """Return the side that each robot puts ahead, in quarter turns to the left, int64 [B]."""
@@ -228,7 +265,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             proprio: o_pr, [M, P].
             instruction: A, int64 [M].
             terminated: beta, bool [M].
-            track: Dead reckoning and what goes with it, [M, 7 or 12].
+            track: Dead reckoning and what goes with it, [M, D].
         """
         part = self.part
         # Shape [M, 1] each.
@@ -244,6 +281,8 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             parts = [self._normal(self.sides.felt(proprio, side)), towards, functional.one_hot(side, self.sides.count)]
         # Positions are clipped like the rest: a robot that is stuck for long must not drown everything else.
         parts += turn_to_instruction(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), *axis)
+        if self.place is not None:
+            parts.append(phases_along(track[:, -PLACE:], torch.cat(axis, -1)))
         parts += [functional.one_hot(instruction, len(Instruction)), terminated[:, None]]
         return self.body_encoder(torch.cat([p.to(proprio.dtype) for p in parts], -1))
 
@@ -273,13 +312,11 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         keep = torch.ones_like(proprio[..., :1]) if first is None else (~first[..., None]).to(proprio.dtype)
         h, c, track = memory
         seen = self.encode(frame.flatten(0, 1))
-        shown = None
-        if self.compass is not None:
-            shown = self.compass.read(frame.flatten(0, 1), seen, proprio.flatten(0, 1)).view(b, t, -1)
+        shown = self.read(frame.flatten(0, 1), seen, proprio.flatten(0, 1)).over(b, t)
         tracks = []
         for i in range(t):
-            past, sight = track * keep[:, i], None if shown is None else shown[:, i]
-            track = self.reckon(proprio[:, i], instruction[:, i], terminated[:, i], past, sight)
+            past = track * keep[:, i]
+            track = self.reckon(proprio[:, i], instruction[:, i], terminated[:, i], past, shown.at(i))
             tracks.append(track)
         tracked = torch.stack(tracks, 1).flatten(0, 1)
         felt = self.embed(proprio.flatten(0, 1), instruction.flatten(), terminated.flatten(), tracked)
@@ -292,8 +329,9 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         features = torch.cat([torch.stack(outputs, 1), mixed], -1)
         tracked = tracked.view(b, t, -1)
         heading = None if self.compass is None else heading_of(tracked[..., _TRACK:_SIDE])
+        place = None if self.place is None else tracked[..., -PLACE:]
         action = self.distribution(features, tracked)
-        return ControllerOutput(action, features, shown, heading, Recurrent(h, c, track))
+        return ControllerOutput(action, features, shown, heading, place, Recurrent(h, c, track))
 
     def over_windows(self, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
         """Return the distributions in the ticks of windows [M, W, ...] from number `skipped` on, [M, W - n, U].
@@ -319,7 +357,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
     def initial_memory(self, batch: int) -> Memory:
         """Return zeros, a `Recurrent`."""
         device = self.device
-        track = _TRACK if self.compass is None else _SIDE + 1
+        track = (_TRACK if self.compass is None else _SIDE + 1) + (0 if self.place is None else PLACE)
         return Recurrent(*(torch.zeros(batch, n, device=device) for n in (self.hidden, self.hidden, track)))
 
     @torch.inference_mode()

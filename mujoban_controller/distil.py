@@ -23,6 +23,7 @@ from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.orientation import sight_loss
+from mujoban_controller.place import cells_off, place_loss
 from mujoban_controller.play import Batch, CameraPlayer, Fields, put_on
 from mujoban_controller.product import ProductLearner, Validation
 from mujoban_controller.skyline import unit
@@ -72,6 +73,8 @@ class DistilConfig:
     kind_weight: float = 0.05
     heading_weight: float = 1.0
     """Weight of what frames show of the heading, for a body that does not feel its own."""
+    place_weight: float = 1.0
+    """Weight of what frames show of the place within a cell."""
     infeasible_weight: float = 1.0
     """Weight of the torques under an instruction towards a wall or a blocked box. Below 1, a student in doubt whether
     a push is possible tries it: the loss is nearly absolute, so it acts from this share of the odds on."""
@@ -89,7 +92,7 @@ class DistilConfig:
         check_counts(self, "first", "warm_up", least=0)
         check_shares(self, "guided", "warm_up_share", "jitter", "average")
         check_positive(self, "reuse", "learning_rate", "clip")
-        weights = ("goal_weight", "kind_weight", "heading_weight", "infeasible_weight")
+        weights = ("goal_weight", "kind_weight", "heading_weight", "place_weight", "infeasible_weight")
         check_not_negative(self, "wander", "noise", *weights)
         if self.sequence < self.window:
             raise ValueError(f"sequence is {self.sequence}: expected at least the ticks of a window, {self.window}")
@@ -108,9 +111,9 @@ class GoalHead(nn.Module):
 
 
 def imitation_loss(
-    output: ControllerOutput, head: GoalHead, batch: Mapping[str, Tensor], config: DistilConfig
+    output: ControllerOutput, head: GoalHead, batch: Mapping[str, Tensor], config: DistilConfig, cell_size: float
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return loss and statistics of a batch of windows [M, W]."""
+    """Return loss and statistics of a batch of windows [M, W]; the edge of a cell is in metres."""
     mean, scale = output.action
     label = batch["label"]
     blocked = (batch["kind"] == GoalKind.HOLD) & (batch["instruction"] != Instruction.STAY)
@@ -124,10 +127,14 @@ def imitation_loss(
     kind = functional.cross_entropy(logits.flatten(0, 1), batch["kind"].flatten())
     loss = action + 0.01 * spread + config.goal_weight * goal + config.kind_weight * kind
     stats = {}
-    if output.shown is not None and output.heading is not None:
-        loss = loss + config.heading_weight * sight_loss(output.shown, batch["heading"])
-        off = (output.heading * unit(batch["heading"])).sum(-1).clamp(-1.0, 1.0).acos()
+    pose = batch["pose"]
+    if output.shown.heading is not None and output.heading is not None:
+        loss = loss + config.heading_weight * sight_loss(output.shown.heading, pose[..., 2])
+        off = (output.heading * unit(pose[..., 2])).sum(-1).clamp(-1.0, 1.0).acos()
         stats["error/heading_degrees"] = off.rad2deg().median()
+    if output.shown.place is not None and output.place is not None:
+        loss = loss + config.place_weight * place_loss(output.shown.place, pose, cell_size)
+        stats["error/place"] = cells_off(output.place, pose, cell_size).median()
     stats |= {
         "loss/action": action,
         "loss/goal": goal,
@@ -175,7 +182,7 @@ class DistilPlayer(CameraPlayer):
         torque = torch.where(self._driven[:, None], torch.from_numpy(label) + self._wandering, own)
         goals = task.world.goals
         extra = {"label": label, "goal": goal_offsets(task.world), "kind": goals.kind.copy()}
-        extra["heading"] = task.world.pose[:, 2].copy()
+        extra["pose"] = task.world.pose.astype(np.float32)
         return torque.clamp(-1.0, 1.0).numpy(), extra
 
     def state(self) -> State:
@@ -245,7 +252,7 @@ class DistilLearner(ProductLearner[Batch]):
         frame = jitter_colours(batch["frame"], config.jitter, self._generator)
         inputs = (batch[name] for name in INPUT_FIELDS if name != "frame")
         output = student(frame, *inputs, memory_of(batch), batch["first"])
-        loss, stats = imitation_loss(output, self.head, batch, config)
+        loss, stats = imitation_loss(output, self.head, batch, config, student.cell_size)
         norm = guarded_step(loss, [self._adam], guard, clip=config.clip)
         if norm is not None:
             self._average.update_parameters(student)

@@ -58,11 +58,13 @@ PLANNER_NODES = 20_000
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Widths of the camera policy."""
+    """What the camera policy is made of."""
 
     channels: tuple[int, ...] = (24, 32, 48, 64)
     features: int = 256
     hidden: int = 192
+    place: bool = True
+    """Whether it keeps where the robot is within its cell."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +260,7 @@ class _Parts:
         if config.initial is not None:
             policy = load_weights(VisuomotorController, config.initial, body=config.task.body)
         else:
-            policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden)
+            policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden, n.place)
         policy.mixed_precision = True
         return policy.to(self.device).train()
 

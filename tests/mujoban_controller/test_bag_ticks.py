@@ -58,7 +58,7 @@ def play_and_record(path, seed):
                 "proprio": inputs.proprio[0], "instruction": int(inputs.instruction[0]),
                 "terminated": bool(inputs.terminated[0]), "action": torque[0],
                 "goal": goal_offsets(task.world)[0], "kind": task.world.goals.kind[0].copy(),
-                "heading": task.world.pose[0, 2],
+                "pose": task.world.pose[0].astype(np.float32),
             })  # fmt: skip
             said = TerminationOutput(np.zeros(1, np.float32), inputs.terminated, np.array([failed]))
             pose = task.world.pose.copy()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mujoban_controller.controller import Recurrent, VisuomotorController
+from mujoban_controller.controller import Recurrent, Sight, VisuomotorController
 from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
 from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_features import side_ahead
@@ -153,14 +153,14 @@ def test_an_ant_that_stands_otherwise_does_the_same_for_an_instruction_turned_as
     with torch.no_grad():
         controller.body_encoder[0].weight[:, -6:-1] = 0.0  # the instruction itself
     for instruction, shown in ((Instruction.EAST, 0.0), (Instruction.NORTH, 90.0)):
-        controller.compass.read = lambda *seen, shown=shown: _sight(shown, shown)
+        controller.read = lambda *seen, shown=shown: Sight(_sight(shown, shown), None)
         inputs = ControllerInput(np.array([int(instruction)]), frame, proprio, np.array([True]), None)
         torque, memory = controller.step(inputs, controller.initial_memory(1))
         assert controller.side_ahead(memory).tolist() == [0]
         torques.append(torque)
     np.testing.assert_allclose(torques[0], torques[1], atol=1e-6)
     # It need not turn round for what lies behind it.
-    controller.compass.read = lambda *seen: _sight(270.0, 270.0)
+    controller.read = lambda *seen: Sight(_sight(270.0, 270.0), None)
     _, memory = controller.step(inputs, controller.initial_memory(1))
     assert controller.side_ahead(memory).tolist() == [2]
 
@@ -175,9 +175,9 @@ def test_the_heading_counts_in_the_loss_of_distillation_and_teaches_the_compass(
     batch = {
         "label": torch.zeros(m, w, ANT.action_size), "kind": torch.zeros(m, w, dtype=torch.int64),
         "instruction": torch.ones(m, w, dtype=torch.int64), "goal": torch.zeros(m, w, 4),
-        "heading": torch.full((m, w), 2.0),
+        "pose": torch.full((m, w, 3), 2.0),
     }  # fmt: skip
-    loss, statistics = imitation_loss(output, GoalHead(16), batch, config)
+    loss, statistics = imitation_loss(output, GoalHead(16), batch, config, ANT.cell_size)
     loss.backward()
     assert controller.compass is not None
     for weights in (controller.compass.lines.weight, controller.compass.skyline.panorama):

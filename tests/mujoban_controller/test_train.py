@@ -22,6 +22,7 @@ from mujoban_controller.mpo import AsymmetricConfig, MPOTrainingConfig
 from mujoban_controller.ppo import PPOTrainingConfig
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, main, make_trainer
+from mujoban_core.bodies import BALL
 from mujoban_core.grid import Instruction
 from mujoban_rl.engine import Trainer
 from mujoban_rl.limits import NaNGuard
@@ -208,12 +209,13 @@ def test_imitation_prefers_the_teachers_torque():
         "goal": torch.zeros(1, 2, 4),
         "kind": torch.zeros(1, 2, dtype=torch.int64),
         "label": torch.full((1, 2, 2), 0.7),
+        "pose": torch.zeros(1, 2, 3),
     }
     optimiser = torch.optim.Adam([*controller.parameters(), *head.parameters()], 1e-2)
     for _ in range(60):
         output = controller(*(batch[k] for k in ("frame", "proprio", "instruction", "terminated")),
                             controller.initial_memory(1))
-        loss, stats = imitation_loss(output, head, batch, DISTIL)
+        loss, stats = imitation_loss(output, head, batch, DISTIL, BALL.cell_size)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -224,7 +226,7 @@ def test_imitation_prefers_the_teachers_torque():
 def test_torques_of_blocked_instructions_weigh_as_configured():
     config = replace(DISTIL, infeasible_weight=0.25)
     controller = VisuomotorController(channels=(8, 8, 8), features=16, hidden=8)
-    batch = {"goal": torch.zeros(1, 1, 4), "label": torch.full((1, 1, 2), 0.7)}
+    batch = {"goal": torch.zeros(1, 1, 4), "label": torch.full((1, 1, 2), 0.7), "pose": torch.zeros(1, 1, 3)}
     output = controller(
         torch.zeros(1, 1, 64, 64, 3, dtype=torch.uint8), torch.zeros(1, 1, controller.proprio_size),
         torch.zeros(1, 1, dtype=torch.int64), torch.zeros(1, 1, dtype=torch.bool), controller.initial_memory(1),
@@ -232,7 +234,7 @@ def test_torques_of_blocked_instructions_weigh_as_configured():
 
     def action_loss(kind: GoalKind, instruction: Instruction) -> float:
         batch["kind"], batch["instruction"] = torch.tensor([[kind]]), torch.tensor([[instruction]])
-        return float(imitation_loss(output, GoalHead(24), batch, config)[1]["loss/action"])
+        return float(imitation_loss(output, GoalHead(24), batch, config, BALL.cell_size)[1]["loss/action"])
 
     full = action_loss(GoalKind.PUSH, Instruction.NORTH)
     assert action_loss(GoalKind.HOLD, Instruction.NORTH) == pytest.approx(0.25 * full)
