@@ -12,7 +12,8 @@ It is also given dead reckoning: how far the robot has come since the instructio
 velocities that it feels. The sum is part of the memory, beside the LSTM's; A, o_pr and beta are all it takes. Where the
 robot is within its cell stands in the memory too (`place`).
 
-Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators, F features, H memory units, D of a track.
+Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators, F features, H memory units, D values
+of a track.
 """
 
 from __future__ import annotations

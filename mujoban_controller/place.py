@@ -1,9 +1,9 @@
 """Where within its cell a robot is, which a controller has to know to keep to its lane.
 
-Pegs, walls and boxes stand on the lattice of cells, so a frame shows where in a cell its viewer is, though not in which:
-a phase along the axis that it faces, up to quarter turns, and one to the left of it. So a needle is kept for each axis
-of the map, which turns once for each cell: what a frame shows is added to it, and it goes with what the robot feels of
-its motion in between.
+Pegs and walls stand on the lattice of cells, so a frame shows where in a cell its viewer is, though not in which: a
+phase along the axis that it faces, up to quarter turns, and one to the left of it. So a needle is kept for each axis of
+the map, which turns once for each cell: what a frame shows is added to it, and it goes with what the robot feels of its
+motion in between.
 
 Shapes: B robots, F features of a frame.
 """
@@ -20,7 +20,7 @@ from torch.nn import functional
 from mujoban_core.grid import turn_to_instruction
 
 PLACE: Final = 4
-"""Components of the needles: cosines of the phases along two axes, then their sines; the middle of a cell is at zero."""
+"""Components of the needles: cosines of the phases along two axes, then their sines; zero in the middle of a cell."""
 _KEPT: Final = 0.95
 """Share of the needles that stays from tick to tick."""
 
