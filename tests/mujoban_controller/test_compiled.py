@@ -15,9 +15,9 @@ from mujoban_rl.weights import WeightsError, save_weights
 
 @pytest.fixture
 def exported(tmp_path):
-    """Weights of a small policy of the ant, which reads its heading from the skyline, with their graph."""
+    """Weights of a small policy of the ant, which reads heading and place from frames, with their graph."""
     torch.manual_seed(0)
-    policy = VisuomotorController("ant", channels=(8, 8), features=16, hidden=8)
+    policy = VisuomotorController("ant", channels=(8, 8), features=16, hidden=8, place=True)
     weights = tmp_path / "controller.safetensors"
     save_weights(weights, policy, policy.config, {})
     export(weights)
