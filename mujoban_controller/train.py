@@ -65,6 +65,8 @@ class NetworkConfig:
     hidden: int = 192
     place: bool = True
     """Whether it keeps where the robot is within its cell."""
+    skill: bool = True
+    """Whether the teacher's layers act on what it guesses of the privileged view; without a teacher they do not."""
 
 
 @dataclass(frozen=True)
@@ -203,9 +205,10 @@ class _Parts:
         return MPOLearner(policy, body, settings, self.generator(), self.validation, critic)
 
     def _distil(self) -> tuple[Learner[Any], Source[Any]]:
-        config, student = self.config, self._camera()
+        config = self.config
         assert config.teacher is not None
         teacher = load_weights(PrivilegedPolicy, config.teacher, body=config.task.body)
+        student = self._camera(teacher if config.network.skill else None)
         learner = DistilLearner(student, config.distil, self.generator(), self.validation)
 
         def player() -> Player:
@@ -255,12 +258,16 @@ class _Parts:
             return load_weights(PrivilegedPolicy, config.initial, self.device, body=config.task.body).train()
         return PrivilegedPolicy(config.task.body, scale=scale).to(self.device)
 
-    def _camera(self) -> VisuomotorController:
+    def _camera(self, teacher: PrivilegedPolicy | None = None) -> VisuomotorController:
+        """Return the camera policy; a fresh one acts by the layers of a teacher, if one is given."""
         config, n = self.config, self.config.network
         if config.initial is not None:
             policy = load_weights(VisuomotorController, config.initial, body=config.task.body)
         else:
-            policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden, n.place)
+            width = 0 if teacher is None else teacher.config["width"]
+            policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden, n.place, width)
+            if teacher is not None and policy.skill is not None:
+                policy.skill.teacher.load_state_dict(teacher.state_dict())
         policy.mixed_precision = True
         return policy.to(self.device).train()
 
