@@ -198,9 +198,7 @@ class BagTicks(Iterator[Fields]):
         memory = Recurrent(*renew_rows(self._memory, fresh, tick["first"]))
         seen = (torch.from_numpy(tick[name]).to(self._policy.device)[:, None] for name in INPUT_FIELDS)
         output = self._policy(*seen, memory=memory)
-        layout = feature_layout(get_body(self._config.body))
-        torque = torch.from_numpy(layout.torque_of(tick["action"], tick["side"]))
-        self._memory = self._policy.applied(output.memory, torque.to(self._policy.device))
+        self._memory = output.memory
         if self._teacher is None:
             # The policy that learns did not play these ticks, but it is the one whose values are asked for.
             mean, scale = (x[:, 0].cpu().numpy() for x in output.action)

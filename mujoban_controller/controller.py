@@ -32,8 +32,6 @@ from mujoban_controller.goal_features import AWAY
 from mujoban_controller.orientation import NEEDLE, Compass, Sides, heading_of
 from mujoban_controller.place import PLACE, Place, phases_along
 from mujoban_controller.policy import GoalPolicy
-from mujoban_controller.reckoning import TRACK, dead_reckoning
-from mujoban_controller.skill import Skill
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CONTROL_PERIOD, Instruction, turn_to_instruction
@@ -47,7 +45,8 @@ INPUT_FIELDS = TICK
 MEMORY_FIELDS = ("memory0", "memory1", "memory2")
 """Its memory before a tick, `Recurrent`."""
 _CLIP = 5.0
-_SIDE = TRACK + NEEDLE
+_TRACK = 7
+_SIDE = _TRACK + NEEDLE
 
 
 class Recurrent(NamedTuple):
@@ -58,14 +57,39 @@ class Recurrent(NamedTuple):
     cell: Tensor
     """LSTM cell, [B, H]."""
     track: Tensor
-    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading needle (4) and side ahead (1) follow,
-    with `place` its needles (4), and with `skill` the torque of the tick before (U) and the ticks that the instruction
-    in force has had (1)."""
+    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading needle (4) and side ahead (1) follow, and
+    with `place` its needles (4)."""
 
 
 def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
     """Return the memory with which the controller went into windows, [M, ...]."""
     return Recurrent(*(batch[name][:, 0] for name in MEMORY_FIELDS))
+
+
+def dead_reckoning(track: Tensor, velocity: Tensor, heading: Tensor, terminated: Tensor, period: float) -> Tensor:
+    """Return the track after one more tick, [B, 7].
+
+    It holds the displacement since the instruction in force began (2), that during the instruction before (2), the
+    velocity of this tick (2), all in the frame of `heading`, and whether there is one (1).
+
+    Args:
+        track: Before the tick, [B, 7]; zeros at an episode's start.
+        velocity: In the robot's frame in cells per second, [B, 2].
+        heading: Unit vector in which the robot faces, [B, 2].
+        terminated: Whether a new instruction begins with this tick, [B].
+        period: Seconds of a tick.
+    """
+    moved, before, last, known = track[:, :2], track[:, 2:4], track[:, 4:6], track[:, 6:]
+    cos, sin = heading.unbind(-1)
+    now = torch.stack(
+        [velocity[:, 0] * cos - velocity[:, 1] * sin, velocity[:, 0] * sin + velocity[:, 1] * cos], -1
+    )
+    # Trapezoidal rule; an episode's first tick has nothing to come from.
+    moved = moved + 0.5 * period * (now + last) * known
+    new = terminated[:, None]
+    before = torch.where(new, moved, before)
+    moved = torch.where(new, torch.zeros_like(moved), moved)
+    return torch.cat([moved, before, now, torch.ones_like(known)], -1)
 
 
 class Sight(NamedTuple):
@@ -98,8 +122,6 @@ class ControllerOutput(NamedTuple):
     """Unit vectors in which the robots face as far as is known, [B, T, 2]; None for a body that feels it."""
     place: Tensor | None
     """The needles of `place`, [B, T, `PLACE`], if there are any."""
-    guess: Tensor | None
-    """What `skill` guesses of the privileged view, [B, T, `GUESSED`], if it does."""
     memory: Recurrent
     """Memory after the last tick."""
 
@@ -122,7 +144,6 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         features: int = 256,
         hidden: int = 192,
         place: bool = False,
-        skill: int = 0,
     ) -> None:
         """Build the network for a body.
 
@@ -132,7 +153,6 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             features: F, width of the fully connected layers.
             hidden: H, width of the LSTM.
             place: Keep where the robot is within its cell. Weights without a word about it do not.
-            skill: Width of a teacher's layers that act on what is guessed of its view (`skill`); 0: there are none.
 
         Raises:
             ValueError: If the body is unknown, or the widths are not what `frame_encoder` takes.
@@ -141,7 +161,6 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         layout = get_body(body)
         self.config = {
             "body": body, "channels": list(channels), "features": features, "hidden": hidden, "place": place,
-            "skill": skill,
         }  # fmt: skip
         self.body = body
         self.mixed_precision = False
@@ -154,12 +173,10 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         self.sides = Sides(layout)
         self.compass = Compass(layout, features) if self.heading_index is None else None
         self.place = Place(features) if place else None
-        self.skill = Skill(layout, hidden + features, skill) if skill else None
         # Where the heading is felt, joint positions are replaced by two sine-cosine pairs; else it is told, and the
         # side ahead, one-hot as A is. Beta is one bit.
         angles = 3 * self.joints if self.compass is None else 2 + self.sides.count
-        inputs = self.proprio_size + angles + len(Instruction) + 1 + TRACK - 1 + PLACE * place
-        self._tracked = (TRACK if self.compass is None else _SIDE + 1) + PLACE * place
+        inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1 + PLACE * place
         shrink = 2 ** (len(channels) - 1)
         # Who does not feel the heading has to look at the skyline.
         self.first_row = rows_of_sky(layout.camera, shrink) if self.compass is None else 0
@@ -216,11 +233,12 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             shown: What the frame shows.
         """
         velocity = proprio[:, self.part.planar_velocity] / self.cell_size
-        before = track[:, :TRACK]
+        before = track[:, :_TRACK]
         if self.compass is None or shown.heading is None:
-            heading, facing = self._heading(proprio), []
+            angle = proprio[:, self.heading_index]
+            heading, facing = torch.stack([angle.cos(), angle.sin()], -1), []
         else:
-            needle = self.compass(shown.heading, proprio, track[:, TRACK:_SIDE])
+            needle = self.compass(shown.heading, proprio, track[:, _TRACK:_SIDE])
             heading, side = heading_of(needle), track[:, _SIDE].long()
             # Chosen for each instruction; and anew where the robot turned, or was mistaken about its heading.
             away = self.sides.relative(heading, instruction, side)[:, 0] < AWAY
@@ -234,26 +252,12 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             parts.append(self.place(shown.place, heading, moved, track[:, -PLACE:]))
         return torch.cat(parts, -1)
 
-    def _heading(self, proprio: Tensor) -> Tensor:
-        """Return the heading that a body feels, unit vectors [..., 2]."""
-        angle = proprio[..., self.heading_index]
-        return torch.stack([angle.cos(), angle.sin()], -1)
-
     def side_ahead(self, memory: Memory) -> Tensor:
         """Return the side that each robot puts ahead, in quarter turns to the left, int64 [B]."""
-        return self._side(Recurrent(*memory).track)
-
-    def _side(self, track: Tensor) -> Tensor:
+        track = Recurrent(*memory).track
         if self.compass is None:
-            return torch.zeros(track.shape[:-1], dtype=torch.int64, device=track.device)
-        return track[..., _SIDE].long()
-
-    def applied(self, memory: Memory, torque: Tensor) -> Recurrent:
-        """Return the memory after torques, [B, U], which need not be those that the policy wanted."""
-        output, cell, track = Recurrent(*memory)
-        if self.skill is None:
-            return Recurrent(output, cell, track)
-        return Recurrent(output, cell, torch.cat([track[:, : self._tracked], torque, track[:, -1:]], -1))
+            return torch.zeros(len(track), dtype=torch.int64, device=track.device)
+        return track[:, _SIDE].long()
 
     def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
         """Return the encoding of all inputs but the frame, [M, F].
@@ -274,7 +278,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             parts += [angle.cos(), angle.sin(), *turn_to_instruction(angle.cos(), angle.sin(), *axis)]
         else:
             side = track[:, _SIDE].long()
-            towards = self.sides.relative(heading_of(track[:, TRACK:_SIDE]), instruction, side)
+            towards = self.sides.relative(heading_of(track[:, _TRACK:_SIDE]), instruction, side)
             parts = [self._normal(self.sides.felt(proprio, side)), towards, functional.one_hot(side, self.sides.count)]
         # Positions are clipped like the rest: a robot that is stuck for long must not drown everything else.
         parts += turn_to_instruction(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), *axis)
@@ -308,7 +312,6 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         b, t = instruction.shape
         keep = torch.ones_like(proprio[..., :1]) if first is None else (~first[..., None]).to(proprio.dtype)
         h, c, track = memory
-        track, done = track[:, : self._tracked], track[:, self._tracked :]
         seen = self.encode(frame.flatten(0, 1))
         shown = self.read(frame.flatten(0, 1), seen, proprio.flatten(0, 1)).over(b, t)
         tracks = []
@@ -326,16 +329,10 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             outputs.append(h)
         features = torch.cat([torch.stack(outputs, 1), mixed], -1)
         tracked = tracked.view(b, t, -1)
-        heading = None if self.compass is None else heading_of(tracked[..., TRACK:_SIDE])
+        heading = None if self.compass is None else heading_of(tracked[..., _TRACK:_SIDE])
         place = None if self.place is None else tracked[..., -PLACE:]
-        action, guess = self.distribution(features, tracked), None
-        if self.skill is not None:
-            guess = self.skill.guess(features)
-            facing = (self._heading(proprio) if heading is None else heading, instruction, self._side(tracked))
-            mean, done = self.skill.over(self.sides, guess, proprio, facing, terminated, keep, done)
-            action = Gaussian(action.mean + mean, action.scale)
-        memory = Recurrent(h, c, torch.cat([track, done], -1))
-        return ControllerOutput(action, features, shown, heading, place, guess, memory)
+        action = self.distribution(features, tracked)
+        return ControllerOutput(action, features, shown, heading, place, Recurrent(h, c, track))
 
     def over_windows(self, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
         """Return the distributions in the ticks of windows [M, W, ...] from number `skipped` on, [M, W - n, U].
@@ -355,13 +352,13 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         own = gaussian(self.mean(x), self.scale(x))
         if self.compass is None:
             return own
-        side = self._side(track)
+        side = track[..., _SIDE].long()
         return Gaussian(self.sides.torques(own.mean, side), self.sides.torques(own.scale, side))
 
     def initial_memory(self, batch: int) -> Memory:
         """Return zeros, a `Recurrent`."""
         device = self.device
-        track = self._tracked + (0 if self.skill is None else self.action_size + 1)
+        track = (_TRACK if self.compass is None else _SIDE + 1) + (0 if self.place is None else PLACE)
         return Recurrent(*(torch.zeros(batch, n, device=device) for n in (self.hidden, self.hidden, track)))
 
     @torch.inference_mode()

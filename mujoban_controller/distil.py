@@ -26,7 +26,6 @@ from mujoban_controller.orientation import sight_loss
 from mujoban_controller.place import cells_off, place_loss
 from mujoban_controller.play import Batch, CameraPlayer, Fields, put_on
 from mujoban_controller.product import ProductLearner, Validation
-from mujoban_controller.skill import guess_loss
 from mujoban_controller.skyline import unit
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
@@ -76,8 +75,6 @@ class DistilConfig:
     """Weight of what frames show of the heading, for a body that does not feel its own."""
     place_weight: float = 1.0
     """Weight of what frames show of the place within a cell."""
-    guess_weight: float = 1.0
-    """Weight of what is guessed of the privileged view, where the teacher's layers act on it."""
     infeasible_weight: float = 1.0
     """Weight of the torques under an instruction towards a wall or a blocked box. Below 1, a student in doubt whether
     a push is possible tries it: the loss is nearly absolute, so it acts from this share of the odds on."""
@@ -95,7 +92,7 @@ class DistilConfig:
         check_counts(self, "first", "warm_up", least=0)
         check_shares(self, "guided", "warm_up_share", "jitter", "average")
         check_positive(self, "reuse", "learning_rate", "clip")
-        weights = ("goal_weight", "kind_weight", "heading_weight", "place_weight", "guess_weight", "infeasible_weight")
+        weights = ("goal_weight", "kind_weight", "heading_weight", "place_weight", "infeasible_weight")
         check_not_negative(self, "wander", "noise", *weights)
         if self.sequence < self.window:
             raise ValueError(f"sequence is {self.sequence}: expected at least the ticks of a window, {self.window}")
@@ -138,8 +135,6 @@ def imitation_loss(
     if output.shown.place is not None and output.place is not None:
         loss = loss + config.place_weight * place_loss(output.shown.place, pose, cell_size)
         stats["error/place"] = cells_off(output.place, pose, cell_size).median()
-    if output.guess is not None:
-        loss = loss + config.guess_weight * guess_loss(output.guess, batch["features"])
     stats |= {
         "loss/action": action,
         "loss/goal": goal,
@@ -187,7 +182,7 @@ class DistilPlayer(CameraPlayer):
         torque = torch.where(self._driven[:, None], torch.from_numpy(label) + self._wandering, own)
         goals = task.world.goals
         extra = {"label": label, "goal": goal_offsets(task.world), "kind": goals.kind.copy()}
-        extra["pose"], extra["features"] = task.world.pose.astype(np.float32), task.features()
+        extra["pose"] = task.world.pose.astype(np.float32)
         return torque.clamp(-1.0, 1.0).numpy(), extra
 
     def state(self) -> State:
@@ -213,16 +208,11 @@ class DistilLearner(ProductLearner[Batch]):
         generator: torch.Generator,
         validation: Validation | None = None,
     ) -> None:
-        """Train `student` in place, where it is; `generator`, on the CPU, draws the jitter of colours.
-
-        A teacher's layers stay as they are: what they do was learned by reward.
-        """
+        """Train `student` in place, where it is; `generator`, on the CPU, draws the jitter of colours."""
         super().__init__(validation or Validation())
         self.student, self.config, self._generator = student, config, generator
         self.head = GoalHead(student.hidden + student.config["features"]).to(student.device)
         self._average = moving_average(student, config.average, warm_up=True)
-        if student.skill is not None:
-            student.skill.teacher.requires_grad_(False)
         parameters = [*student.parameters(), *self.head.parameters()]
         self._adam = torch.optim.Adam(parameters, config.learning_rate, fused=True)
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up_share))

@@ -22,21 +22,18 @@ from mujoban_core.grid import GRID_SIZE, INSTRUCTION_AXES, OFFSETS_XY, cell_to_x
 from mujoban_sim.driving import wrap_angles
 from mujoban_sim.goals import GoalKind
 
-_AROUND = np.array([[x, y] for x in (-1, 0, 1, 2) for y in (-1, 0, 1) if (x, y) != (0, 0)], np.float64)
+_NEIGHBOURS = np.array([[x, y] for x in (-1, 0, 1, 2) for y in (-1, 0, 1) if (x, y) != (0, 0)], np.float64)
 """Cells around the origin cell whose contents matter, (along, left), [11, 2]."""
-_MIRRORED_AROUND = [int((n * [1, -1] == _AROUND).all(1).argmax()) for n in _AROUND]
-NEIGHBOURS = len(_AROUND)
-"""Their number."""
+_MIRRORED_NEIGHBOURS = [int((n * [1, -1] == _NEIGHBOURS).all(1).argmax()) for n in _NEIGHBOURS]
 GOAL_SIZE = 4
 """Values of `goal_offsets`."""
-NEAR = 5.0
+_NEAR = 5.0
 """Offsets are told a second time, that much larger and limited to [-1, 1]: what matters is the last tenth of a cell."""
 AWAY = 0.5
 """Cosine of the angle between the side ahead and the instruction, 60 degrees, from which on another is put ahead."""
 _LOOK_AGAIN = 30
 """Ticks after which a robot with several fronts chooses again which one it puts ahead, unless it pushes."""
-GRAVITY = 9.81
-"""[m/s^2]"""
+_GRAVITY = 9.81
 BOX_FRICTION = 0.5
 """Sliding friction of a box on the floor, in every world; how far a box coasts follows from it."""
 
@@ -97,14 +94,14 @@ def feature_layout(body: Body) -> FeatureLayout:
     ]
     plain = [_VECTOR, _ROTATION, _VECTOR, *[_FLIP_Y] * 12, (1.0,), (1.0, 1.0, 1.0), (1.0,)]
     blocks += [(np.arange(len(s)), np.array(s)) for s in plain]
-    blocks += [(np.array(_MIRRORED_AROUND), np.ones(len(_AROUND)))] * 2
+    blocks += [(np.array(_MIRRORED_NEIGHBOURS), np.ones(len(_NEIGHBOURS)))] * 2
     start, sources = 0, []
     for block, _ in blocks:
         sources.append(start + block)
         start += len(block)
     mirror = Rearrangement(np.concatenate(sources), np.concatenate([s for _, s in blocks]).astype(np.float32))
     seen = Rearrangement(views[0], views[1].astype(np.float32))
-    holds = start - 2 * len(_AROUND) - 2  # the last of the goal's kinds, behind which the elapsed time stands
+    holds = start - 2 * len(_NEIGHBOURS) - 2  # the last of the goal's kinds, behind which the elapsed time stands
     return FeatureLayout(start, mirror, Rearrangement(acting, acting_sign.astype(np.float32)), seen, actuators, holds)
 
 
@@ -152,7 +149,7 @@ def rest_position(world: GoalView) -> NDArray[np.float64]:
     """Return where the pushed boxes will come to rest if they coast along the instruction, in metres, [B, 2]."""
     goals, rows = world.goals, np.arange(world.batch)
     speed = world.box_speed[rows, goals.box_index].astype(np.float64)
-    coast = speed**2 / (2 * BOX_FRICTION * GRAVITY)
+    coast = speed**2 / (2 * BOX_FRICTION * _GRAVITY)
     return world.box_position[rows, goals.box_index].astype(np.float64) + coast[:, None] * OFFSETS_XY[goals.direction]
 
 
@@ -191,7 +188,7 @@ def privileged_features(
         _relative_heading(world, heading, lane),
         *(_turn(v, ahead) for v in vectors),
         *(_turn(v, lane) for v in vectors[:3]),
-        *(np.clip(NEAR * _turn(v, lane), -1.0, 1.0) for v in (to_target, to_box, box_left, rest_left)),
+        *(np.clip(_NEAR * _turn(v, lane), -1.0, 1.0) for v in (to_target, to_box, box_left, rest_left)),
         np.where(push, world.box_speed[rows, goals.box_index][:, None] / size, 0.0),
         np.eye(len(GoalKind) - 1)[np.minimum(goals.kind, GoalKind.HOLD)],
         elapsed[:, None],
@@ -224,7 +221,7 @@ def _surroundings(world: GoalView, along: NDArray[np.float64]) -> NDArray[np.flo
     """Return whether a wall, and whether a box, is in each of the cells around the origin cell, [B, 22]."""
     rows = np.arange(world.batch)[:, None]
     origin, left = cell_to_xy(world.goals.origin_cell), np.stack([-along[:, 1], along[:, 0]], 1)
-    around = origin[:, None] + _AROUND[:, :1] * along[:, None] + _AROUND[:, 1:] * left[:, None]
+    around = origin[:, None] + _NEIGHBOURS[:, :1] * along[:, None] + _NEIGHBOURS[:, 1:] * left[:, None]
     cells = np.clip(xy_to_cell(around), 0, GRID_SIZE - 1)
     wall = world.wall[rows, cells[..., 0], cells[..., 1]]
     box = (cells[:, :, None] == world.box_cell[:, None]).all(-1).any(-1)

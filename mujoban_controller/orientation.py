@@ -119,7 +119,6 @@ class Sides(nn.Module):
 
     source: Tensor
     sign: Tensor
-    order: Tensor
     own: Tensor
     axes: Tensor
 
@@ -132,7 +131,6 @@ class Sides(nn.Module):
         """S."""
         self.register_buffer("source", torch.from_numpy(layout.proprio.source), persistent=False)
         self.register_buffer("sign", torch.from_numpy(layout.proprio.sign), persistent=False)
-        self.register_buffer("order", order, persistent=False)
         self.register_buffer("own", order.argsort(1), persistent=False)
         self.register_buffer("axes", torch.tensor(INSTRUCTION_AXES, dtype=torch.float32), persistent=False)
 
@@ -160,7 +158,3 @@ class Sides(nn.Module):
     def torques(self, action: Tensor, side: Tensor) -> Tensor:
         """Return the body's torques, [M, U], of actions in the order in which the side ahead sees them."""
         return action.gather(-1, self.own[side])
-
-    def actions(self, torque: Tensor, side: Tensor) -> Tensor:
-        """Return the actions, [M, U], that torques are in the order in which the side ahead sees them."""
-        return torque.gather(-1, self.order[side])

@@ -138,7 +138,6 @@ class CameraPlayer(TaskPlayer):
         kept: Fields = {name: getattr(inputs, name) for name in INPUT_FIELDS}
         kept |= {name: m.cpu().numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
         torque, extra = self._act(inputs, *(x[:, 0].cpu() for x in output.action))
-        self._memory = self._policy.applied(output.memory, torch.from_numpy(torque).to(self._policy.device))
         result = task.step(torque)
         kept |= {"first": first, **extra, **_outcome(result)}
         return kept, result.outcomes

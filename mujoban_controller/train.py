@@ -65,8 +65,6 @@ class NetworkConfig:
     hidden: int = 192
     place: bool = True
     """Whether it keeps where the robot is within its cell."""
-    skill: bool = True
-    """Whether the teacher's layers act on what it guesses of the privileged view; without a teacher they do not."""
 
 
 @dataclass(frozen=True)
@@ -205,10 +203,9 @@ class _Parts:
         return MPOLearner(policy, body, settings, self.generator(), self.validation, critic)
 
     def _distil(self) -> tuple[Learner[Any], Source[Any]]:
-        config = self.config
+        config, student = self.config, self._camera()
         assert config.teacher is not None
         teacher = load_weights(PrivilegedPolicy, config.teacher, body=config.task.body)
-        student = self._camera(teacher if config.network.skill else None)
         learner = DistilLearner(student, config.distil, self.generator(), self.validation)
 
         def player() -> Player:
@@ -258,16 +255,12 @@ class _Parts:
             return load_weights(PrivilegedPolicy, config.initial, self.device, body=config.task.body).train()
         return PrivilegedPolicy(config.task.body, scale=scale).to(self.device)
 
-    def _camera(self, teacher: PrivilegedPolicy | None = None) -> VisuomotorController:
-        """Return the camera policy; a fresh one acts by the layers of a teacher, if one is given."""
+    def _camera(self) -> VisuomotorController:
         config, n = self.config, self.config.network
         if config.initial is not None:
             policy = load_weights(VisuomotorController, config.initial, body=config.task.body)
         else:
-            width = 0 if teacher is None else teacher.config["width"]
-            policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden, n.place, width)
-            if teacher is not None and policy.skill is not None:
-                policy.skill.teacher.load_state_dict(teacher.state_dict())
+            policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden, n.place)
         policy.mixed_precision = True
         return policy.to(self.device).train()
 

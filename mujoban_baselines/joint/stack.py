@@ -54,5 +54,4 @@ class DrawingController(Controller):
         """Return torques limited to [-1, 1], [B, U], and the next memory."""
         output = self.network(*self.network.to_tensors(inputs), memory=Recurrent(*state))
         mean, scale = output.action.mean[:, 0], output.action.scale[:, 0]
-        torque = drawn_torque(mean, scale, self._explore, self._generator)
-        return torque, self.network.applied(output.memory, torch.from_numpy(torque))
+        return drawn_torque(mean, scale, self._explore, self._generator), output.memory

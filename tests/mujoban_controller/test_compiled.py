@@ -17,7 +17,7 @@ from mujoban_rl.weights import WeightsError, save_weights
 def exported(tmp_path):
     """Weights of a small policy of the ant, which reads heading and place from frames, with their graph."""
     torch.manual_seed(0)
-    policy = VisuomotorController("ant", channels=(8, 8), features=16, hidden=8, place=True, skill=16)
+    policy = VisuomotorController("ant", channels=(8, 8), features=16, hidden=8, place=True)
     weights = tmp_path / "controller.safetensors"
     save_weights(weights, policy, policy.config, {})
     export(weights)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mujoban_controller.controller import VisuomotorController
-from mujoban_controller.reckoning import dead_reckoning
+from mujoban_controller.controller import VisuomotorController, dead_reckoning
 from mujoban_core.bodies import BALL, INERTIAL_SIZE
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
