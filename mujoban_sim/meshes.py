@@ -186,8 +186,10 @@ def skyline_mesh(cell_size: float) -> Mesh:
     vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     normals = np.stack([-x / radius, -y / radius, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     index = np.arange(x.size).reshape(x.shape)
-    low, low_next = index[:-1, :-1], index[:-1, 1:]
-    high, high_next = index[1:, :-1], index[1:, 1:]
+    # The ring at the texture's edge is there twice, with nothing in between.
+    strips = np.flatnonzero(np.diff(heights))
+    low, low_next = index[strips, :-1], index[strips, 1:]
+    high, high_next = index[strips + 1, :-1], index[strips + 1, 1:]
     faces = np.stack(
         [np.stack([low, high, high_next], axis=-1), np.stack([low, high_next, low_next], axis=-1)], axis=-2
     )

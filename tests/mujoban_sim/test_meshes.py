@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from mujoban_core.grid import cell_to_xy, xy_to_cell
 from mujoban_sim.appearance import Atlas
-from mujoban_sim.meshes import MAX_QUADS, level_mesh, skyline_mesh
+from mujoban_sim.meshes import MAX_QUADS, SKYLINE_HEIGHTS, SKYLINE_RADIUS, SKYLINE_ROWS, level_mesh, skyline_mesh
 from mujoban_sim.scene import PEG_HEIGHT, peg_corners
 
 BAND = Atlas(0.5).band_range
@@ -77,3 +77,12 @@ def test_pegs_stand_turned_by_45_degrees_at_the_corners_of_cells():
 def test_the_skyline_faces_inwards():
     corners, cross, _ = triangles(skyline_mesh(1.0))
     assert (np.einsum("ij,ij->i", cross, corners.mean(axis=1) * (1, 1, 0)) < 0).all()
+
+
+def test_above_the_skylines_texture_there_is_sky():
+    mesh = skyline_mesh(1.0)
+    corners, v = mesh.vertices[mesh.faces], mesh.texcoords[mesh.faces][..., 1]
+    above = corners[..., 2].min(axis=1) > SKYLINE_HEIGHTS[-1] * SKYLINE_RADIUS - 1e-3
+    assert corners[above][..., 2].max() > 2.0 * SKYLINE_RADIUS
+    # The middle of the last row: its edge would show half of the first one.
+    np.testing.assert_allclose(v[above], 1.0 - 0.5 / SKYLINE_ROWS)
