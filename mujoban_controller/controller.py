@@ -6,7 +6,7 @@ the mean and scale of a normal distribution over torques.
 Proprioception holds joint positions, so the network is given sine and cosine of each hinge, as they are and
 turned into the frame of the instruction (instructed direction = +x). For the ball, whose steer joint is the
 heading, this says at once by how much to turn. A body that does not feel its heading is given what its gyro and the
-skyline say of it instead, and feels and acts as the side sees it that it puts ahead (`orientation`).
+frames say of it instead, and feels and acts as the side sees it that it puts ahead (`orientation`).
 
 It is also given dead reckoning: how far the robot has come since the instruction began, which is the sum of the
 velocities that it feels. The sum is part of the memory, beside the LSTM's; A, o_pr and beta are all it takes. Where the
@@ -32,6 +32,7 @@ from mujoban_controller.goal_features import AWAY
 from mujoban_controller.orientation import NEEDLE, Compass, Sides, heading_of
 from mujoban_controller.place import PLACE, Place, phases_along
 from mujoban_controller.policy import GoalPolicy
+from mujoban_controller.skyline import unit
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CONTROL_PERIOD, Instruction, turn_to_instruction
@@ -79,17 +80,23 @@ def dead_reckoning(track: Tensor, velocity: Tensor, heading: Tensor, terminated:
         terminated: Whether a new instruction begins with this tick, [B].
         period: Seconds of a tick.
     """
-    moved, before, last, known = track[:, :2], track[:, 2:4], track[:, 4:6], track[:, 6:]
+    moved, before, known = track[:, :2], track[:, 2:4], track[:, 6:]
     cos, sin = heading.unbind(-1)
     now = torch.stack(
         [velocity[:, 0] * cos - velocity[:, 1] * sin, velocity[:, 0] * sin + velocity[:, 1] * cos], -1
     )
-    # Trapezoidal rule; an episode's first tick has nothing to come from.
-    moved = moved + 0.5 * period * (now + last) * known
+    moved = moved + displacement(track, now, period)
     new = terminated[:, None]
     before = torch.where(new, moved, before)
     moved = torch.where(new, torch.zeros_like(moved), moved)
     return torch.cat([moved, before, now, torch.ones_like(known)], -1)
+
+
+def displacement(track: Tensor, velocity: Tensor, period: float) -> Tensor:
+    """Return how far a robot came since the tick before, [B, 2], given the track then and its velocity now, [B, 2]."""
+    last, known = track[:, 4:6], track[:, 6:]
+    # Trapezoidal rule; an episode's first tick has nothing to come from.
+    return 0.5 * period * (velocity + last) * known
 
 
 class Sight(NamedTuple):
@@ -235,8 +242,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         velocity = proprio[:, self.part.planar_velocity] / self.cell_size
         before = track[:, :_TRACK]
         if self.compass is None or shown.heading is None:
-            angle = proprio[:, self.heading_index]
-            heading, facing = torch.stack([angle.cos(), angle.sin()], -1), []
+            heading, facing = unit(proprio[:, self.heading_index]), []
         else:
             needle = self.compass(shown.heading, proprio, track[:, _TRACK:_SIDE])
             heading, side = heading_of(needle), track[:, _SIDE].long()
@@ -248,7 +254,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         reckoned = dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
         parts = [reckoned, *facing]
         if self.place is not None and shown.place is not None:
-            moved = 0.5 * CONTROL_PERIOD * (reckoned[:, 4:6] + before[:, 4:6]) * before[:, 6:]
+            moved = displacement(before, reckoned[:, 4:6], CONTROL_PERIOD)
             parts.append(self.place(shown.place, heading, moved, track[:, -PLACE:]))
         return torch.cat(parts, -1)
 

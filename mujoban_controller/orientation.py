@@ -87,9 +87,8 @@ def sight_loss(shown: Tensor, heading: Tensor) -> Tensor:
 
 def _turn(vector: Tensor, angle: Tensor) -> Tensor:
     """Return vectors [..., 2] turned to the left by angles [...]."""
-    cos, sin = angle.cos(), angle.sin()
     x, y = vector.unbind(-1)
-    return torch.stack([cos * x - sin * y, sin * x + cos * y], -1)
+    return torch.stack(turn_to_instruction(x, y, angle.cos(), -angle.sin()), -1)
 
 
 def _concentration(mean: Tensor) -> Tensor:

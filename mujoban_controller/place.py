@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_controller.skyline import unit
 from mujoban_core.grid import turn_to_instruction
 
 PLACE: Final = 4
@@ -44,8 +45,7 @@ class Place(nn.Module):
         """
         cosine, sine = place.split(2, -1)
         turn = math.tau * moved
-        cos, sin = turn.cos(), turn.sin()
-        carried = torch.cat([cos * cosine - sin * sine, sin * cosine + cos * sine], -1)
+        carried = torch.cat(turn_to_instruction(cosine, sine, turn.cos(), -turn.sin()), -1)
         ahead = _axis_ahead(heading.detach())
         back = torch.stack([ahead[..., 0], -ahead[..., 1]], -1)
         return _KEPT * carried + (1.0 - _KEPT) * phases_along(shown, back)
@@ -79,14 +79,12 @@ def phases(pose: Tensor, cell_size: float) -> Tensor:
 
 def place_loss(shown: Tensor, pose: Tensor, cell_size: float) -> Tensor:
     """Return how far what frames show of phases, [..., `PLACE`], is off poses (x [m], y [m], psi), [..., 3]."""
-    heading = torch.stack([pose[..., 2].cos(), pose[..., 2].sin()], -1)
+    heading = unit(pose[..., 2])
     # Squares make it the mean of what may be: short where a frame shows little.
     return functional.mse_loss(shown, phases_along(phases(pose, cell_size), _axis_ahead(heading)))
 
 
 def cells_off(place: Tensor, pose: Tensor, cell_size: float) -> Tensor:
     """Return by how many cells needles, [..., `PLACE`], are off poses (x [m], y [m], psi), along x and y, [..., 2]."""
-    truth = phases(pose, cell_size)
-    cosine = place[..., :2] * truth[..., :2] + place[..., 2:] * truth[..., 2:]
-    sine = place[..., 2:] * truth[..., :2] - place[..., :2] * truth[..., 2:]
+    cosine, sine = turn_to_instruction(*place.split(2, -1), *phases(pose, cell_size).split(2, -1))
     return torch.atan2(sine, cosine).abs() / math.tau
