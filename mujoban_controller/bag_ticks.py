@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_controller.controller import INPUT_FIELDS, MEMORY_FIELDS, Recurrent, VisuomotorController
-from mujoban_controller.goal_features import feature_layout, goal_offsets, looks_again, privileged_features, side_ahead
+from mujoban_controller.goal_features import goal_offsets, privileged_features
 from mujoban_controller.goal_rewards import GoalReward, fallen
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import Outcome
@@ -91,7 +91,6 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
     terminated[0] = False
     applied = np.stack(torque).astype(np.float32)
     before = np.concatenate([np.zeros_like(applied[:1]), applied[:-1]])
-    side = _sides(view, elapsed)
     rule = GoalReward(config.reward)
     there = rule.before(view.at(now, now))
     change = (applied - before)[:-1]
@@ -100,14 +99,13 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
     # What comes after the last tick is another episode.
     discount[last] = 0.0
     fields = {
-        "features": privileged_features(view, elapsed, before, side)[:-1],
-        "side": side[:-1],
+        "features": privileged_features(view, elapsed, before)[:-1],
         "first": now == 0,
         "frame": np.stack(frame)[:-1],
         "proprio": view.proprio[:-1],
         "instruction": np.array([i.direction for i in instruction], np.int64)[:-1],
         "terminated": terminated[:-1],
-        "action": feature_layout(body).action_of(applied, side)[:-1],
+        "action": applied[:-1],
         "reward": rule.after(view.at(now + 1, now), there, change, ended & completed[1:], failed),
         "discount": discount,
         "truncated": (discount == 0.0) & ~failed,
@@ -116,14 +114,6 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
         "pose": view.pose[:-1].astype(np.float32),
     }
     return {name: values[: last + 1] for name, values in fields.items()}
-
-
-def _sides(view: StoredView, elapsed: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the side ahead at each tick, as the goal task chooses it, [L]."""
-    side, ticks = side_ahead(view), np.rint(elapsed * INSTRUCTION_LIMIT).astype(np.int64)
-    again = looks_again(ticks, view.goals.kind)
-    since = np.maximum.accumulate(np.where(again, np.arange(len(side)), 0))
-    return side[since]
 
 
 def _goals(
@@ -226,8 +216,7 @@ def _check_about(bag: Bag, config: GoalTaskConfig) -> None:
 
 def labels(teacher: PrivilegedPolicy, fields: Fields) -> NDArray[np.float32]:
     """Return the torques that a teacher would have applied in the ticks of an episode, [L - 1, U]."""
-    layout = feature_layout(get_body(teacher.config["body"]))
-    return layout.torque_of(teacher.act(fields["features"]), fields["side"])
+    return teacher.act(fields["features"])
 
 
 class BagPlayer(Player):

@@ -5,8 +5,8 @@ the mean and scale of a normal distribution over torques.
 
 Proprioception holds joint positions, so the network is given sine and cosine of each hinge, as they are and
 turned into the frame of the instruction (instructed direction = +x). For the ball, whose steer joint is the
-heading, this says at once by how much to turn. A body that does not feel its heading is given what its gyro and the
-frames say of it instead, and feels and acts as the side sees it that it puts ahead (`orientation`).
+heading, this says at once by how much to turn. A body that does not feel its heading is told it by its gyro and the
+frames (`orientation`).
 
 It is also given dead reckoning: how far the robot has come since the instruction began, which is the sum of the
 velocities that it feels. The sum is part of the memory, beside the LSTM's; A, o_pr and beta are all it takes. Where the
@@ -28,14 +28,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_controller.drivers import ControllerDriver, Driver
-from mujoban_controller.goal_features import AWAY
-from mujoban_controller.orientation import NEEDLE, Compass, Sides, heading_of
+from mujoban_controller.orientation import NEEDLE, Compass, heading_of
 from mujoban_controller.place import PLACE, Place, phases_along
 from mujoban_controller.policy import GoalPolicy
 from mujoban_controller.skyline import unit
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.grid import CONTROL_PERIOD, Instruction, turn_to_instruction
+from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
 from mujoban_rl.compiled import Compilable
 from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder, gaussian, gaussian_layers, rows_of_sky
@@ -47,7 +46,7 @@ MEMORY_FIELDS = ("memory0", "memory1", "memory2")
 """Its memory before a tick, `Recurrent`."""
 _CLIP = 5.0
 _TRACK = 7
-_SIDE = _TRACK + NEEDLE
+_NEEDLE = _TRACK + NEEDLE
 
 
 class Recurrent(NamedTuple):
@@ -58,8 +57,8 @@ class Recurrent(NamedTuple):
     cell: Tensor
     """LSTM cell, [B, H]."""
     track: Tensor
-    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading needle (4) and side ahead (1) follow, and
-    with `place` its needles (4)."""
+    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading the needle (4) follows, and with `place` its
+    needles (4)."""
 
 
 def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
@@ -140,7 +139,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
     """
 
     file_name = "controller"
-    acts_ahead = False
+    axes: Tensor
     proprio_mean: Tensor
     proprio_scale: Tensor
 
@@ -177,12 +176,12 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         self.heading_index = layout.heading_index
         self.part = layout.proprio
         self.cell_size = layout.cell_size
-        self.sides = Sides(layout)
+        self.register_buffer("axes", torch.tensor(INSTRUCTION_AXES, dtype=torch.float32), persistent=False)
         self.compass = Compass(layout, features) if self.heading_index is None else None
         self.place = Place(features) if place else None
-        # Where the heading is felt, joint positions are replaced by two sine-cosine pairs; else it is told, and the
-        # side ahead, one-hot as A is. Beta is one bit.
-        angles = 3 * self.joints if self.compass is None else 2 + self.sides.count
+        # Where the heading is felt, joint positions are replaced by two sine-cosine pairs; else where the instruction
+        # leads is told, as the robot sees it. A is one-hot, beta one bit.
+        angles = 3 * self.joints if self.compass is None else 2
         inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1 + PLACE * place
         shrink = 2 ** (len(channels) - 1)
         # Who does not feel the heading has to look at the skyline.
@@ -203,12 +202,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         return not bool((self.proprio_scale == 1.0).all())
 
     def fit_normalisation(self, proprio: Tensor) -> None:
-        """Take mean and deviation of proprioceptive samples, [M, P], for the normalisation of inputs.
-
-        Each is taken as any side would see it that may be ahead.
-        """
-        sides = torch.arange(self.sides.count, device=proprio.device).repeat_interleave(len(proprio))
-        proprio = self.sides.felt(proprio.repeat(self.sides.count, 1), sides)
+        """Take mean and deviation of proprioceptive samples, [M, P], for the normalisation of inputs."""
         self.proprio_mean.copy_(proprio.mean(0))
         self.proprio_scale.copy_(proprio.std(0).clamp(min=1e-2))
 
@@ -227,14 +221,11 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         heading = None if self.compass is None else self.compass.read(frame, features, proprio)
         return Sight(heading, None if self.place is None else self.place.read(features))
 
-    def reckon(
-        self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor, shown: Sight
-    ) -> Tensor:
+    def reckon(self, proprio: Tensor, terminated: Tensor, track: Tensor, shown: Sight) -> Tensor:
         """Return the track after one more tick, [B, D].
 
         Args:
             proprio: o_pr, [B, P].
-            instruction: A, int64 [B].
             terminated: beta, bool [B].
             track: Before the tick; zeros at an episode's start.
             shown: What the frame shows.
@@ -242,28 +233,16 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         velocity = proprio[:, self.part.planar_velocity] / self.cell_size
         before = track[:, :_TRACK]
         if self.compass is None or shown.heading is None:
-            heading, facing = unit(proprio[:, self.heading_index]), []
+            heading, needles = unit(proprio[:, self.heading_index]), []
         else:
-            needle = self.compass(shown.heading, proprio, track[:, _TRACK:_SIDE])
-            heading, side = heading_of(needle), track[:, _SIDE].long()
-            # Chosen for each instruction; and anew where the robot turned, or was mistaken about its heading.
-            away = self.sides.relative(heading, instruction, side)[:, 0] < AWAY
-            new = terminated | (before[:, -1] == 0) | away
-            side = torch.where(new, self.sides.ahead(heading, instruction), side)
-            facing = [needle, side[:, None].to(needle.dtype)]
+            needles = [self.compass(shown.heading, proprio, track[:, _TRACK:_NEEDLE])]
+            heading = heading_of(*needles)
         reckoned = dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
-        parts = [reckoned, *facing]
+        parts = [reckoned, *needles]
         if self.place is not None and shown.place is not None:
             moved = displacement(before, reckoned[:, 4:6], CONTROL_PERIOD)
             parts.append(self.place(shown.place, heading, moved, track[:, -PLACE:]))
         return torch.cat(parts, -1)
-
-    def side_ahead(self, memory: Memory) -> Tensor:
-        """Return the side that each robot puts ahead, in quarter turns to the left, int64 [B]."""
-        track = Recurrent(*memory).track
-        if self.compass is None:
-            return torch.zeros(len(track), dtype=torch.int64, device=track.device)
-        return track[:, _SIDE].long()
 
     def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
         """Return the encoding of all inputs but the frame, [M, F].
@@ -275,21 +254,20 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             track: Dead reckoning and what goes with it, [M, D].
         """
         part = self.part
+        normal = self._normal(proprio)
         # Shape [M, 1] each.
-        axis = tuple(x[:, None] for x in self.sides.axes[instruction].unbind(-1))
+        x, y = (v[:, None] for v in self.axes[instruction].unbind(-1))
         if self.compass is None:
             angle = proprio[:, part.joint_position]
-            normal = self._normal(proprio)
             parts = [normal[:, part.inertial], normal[:, part.joint_velocity], normal[:, part.up_axis]]
-            parts += [angle.cos(), angle.sin(), *turn_to_instruction(angle.cos(), angle.sin(), *axis)]
+            parts += [angle.cos(), angle.sin(), *turn_to_instruction(angle.cos(), angle.sin(), x, y)]
         else:
-            side = track[:, _SIDE].long()
-            towards = self.sides.relative(heading_of(track[:, _TRACK:_SIDE]), instruction, side)
-            parts = [self._normal(self.sides.felt(proprio, side)), towards, functional.one_hot(side, self.sides.count)]
+            heading = heading_of(track[:, _TRACK:_NEEDLE])
+            parts = [normal, *turn_to_instruction(x, y, heading[:, :1], heading[:, 1:])]
         # Positions are clipped like the rest: a robot that is stuck for long must not drown everything else.
-        parts += turn_to_instruction(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), *axis)
+        parts += turn_to_instruction(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), x, y)
         if self.place is not None:
-            parts.append(phases_along(track[:, -PLACE:], torch.cat(axis, -1)))
+            parts.append(phases_along(track[:, -PLACE:], torch.cat([x, y], -1)))
         parts += [functional.one_hot(instruction, len(Instruction)), terminated[:, None]]
         return self.body_encoder(torch.cat([p.to(proprio.dtype) for p in parts], -1))
 
@@ -323,7 +301,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         tracks = []
         for i in range(t):
             past = track * keep[:, i]
-            track = self.reckon(proprio[:, i], instruction[:, i], terminated[:, i], past, shown.at(i))
+            track = self.reckon(proprio[:, i], terminated[:, i], past, shown.at(i))
             tracks.append(track)
         tracked = torch.stack(tracks, 1).flatten(0, 1)
         felt = self.embed(proprio.flatten(0, 1), instruction.flatten(), terminated.flatten(), tracked)
@@ -335,10 +313,9 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             outputs.append(h)
         features = torch.cat([torch.stack(outputs, 1), mixed], -1)
         tracked = tracked.view(b, t, -1)
-        heading = None if self.compass is None else heading_of(tracked[..., _TRACK:_SIDE])
+        heading = None if self.compass is None else heading_of(tracked[..., _TRACK:_NEEDLE])
         place = None if self.place is None else tracked[..., -PLACE:]
-        action = self.distribution(features, tracked)
-        return ControllerOutput(action, features, shown, heading, place, Recurrent(h, c, track))
+        return ControllerOutput(self.distribution(features), features, shown, heading, place, Recurrent(h, c, track))
 
     def over_windows(self, batch: Mapping[str, Tensor], skipped: int) -> Gaussian:
         """Return the distributions in the ticks of windows [M, W, ...] from number `skipped` on, [M, W - n, U].
@@ -352,19 +329,15 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         """Return a driver by the mean torques, with a memory of its own."""
         return ControllerDriver(self)
 
-    def distribution(self, features: Tensor, track: Tensor) -> Gaussian:
-        """Return the distribution over torques given `ControllerOutput.features` and the tracks, [B, T, ...]."""
+    def distribution(self, features: Tensor) -> Gaussian:
+        """Return the distribution over torques given `ControllerOutput.features`, [B, T, ...]."""
         x = self.trunk(features)
-        own = gaussian(self.mean(x), self.scale(x))
-        if self.compass is None:
-            return own
-        side = track[..., _SIDE].long()
-        return Gaussian(self.sides.torques(own.mean, side), self.sides.torques(own.scale, side))
+        return gaussian(self.mean(x), self.scale(x))
 
     def initial_memory(self, batch: int) -> Memory:
         """Return zeros, a `Recurrent`."""
         device = self.device
-        track = (_TRACK if self.compass is None else _SIDE + 1) + (0 if self.place is None else PLACE)
+        track = (_TRACK if self.compass is None else _NEEDLE) + (0 if self.place is None else PLACE)
         return Recurrent(*(torch.zeros(batch, n, device=device) for n in (self.hidden, self.hidden, track)))
 
     @torch.inference_mode()

@@ -168,7 +168,6 @@ class DistilPlayer(CameraPlayer):
 
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
         config, task, generator = self._config, self.task, self.generator
-        task.put_ahead(self.policy.side_ahead(self._memory).cpu().numpy())
         label = self._teacher(task)
         if self._frames % (config.window * len(mean)) == 0:
             share = max(1.0 - self._frames / max(config.warm_up, 1), config.guided)

@@ -1,11 +1,10 @@
 """What the critic and a privileged teacher see: robot, goal, boxes and walls around (paper C.3).
 
 Lengths are in cells, and everything is seen from two frames: the *instruction's*, whose x-axis is the instructed
-direction and whose y-axis points to its left, and the *robot's*, whose x-axis is the heading of the side that it puts
-ahead. So one policy serves all directions, and a body whose sides are alike (`Body.symmetry`) always sees a goal that
-lies ahead. Mirroring the features (`FeatureLayout.mirror`) gives what the mirrored robot sees.
+direction and whose y-axis points to its left, and the *robot's*, whose x-axis is its heading. So one policy serves all
+directions. Mirroring the features (`FeatureLayout.mirror`) gives what the mirrored robot sees.
 
-Shapes: B robots, K boxes, J joints, U actuators, P proprioceptive values, D features.
+Shapes: B robots, K boxes, J joints, U actuators, D features.
 """
 
 from __future__ import annotations
@@ -29,10 +28,6 @@ GOAL_SIZE = 4
 """Values of `goal_offsets`."""
 _NEAR = 5.0
 """Offsets are told a second time, that much larger and limited to [-1, 1]: what matters is the last tenth of a cell."""
-AWAY = 0.5
-"""Cosine of the angle between the side ahead and the instruction, 60 degrees, from which on another is put ahead."""
-_LOOK_AGAIN = 30
-"""Ticks after which a robot with several fronts chooses again which one it puts ahead, unless it pushes."""
 _GRAVITY = 9.81
 BOX_FRICTION = 0.5
 """Sliding friction of a box on the floor, in every world; how far a box coasts follows from it."""
@@ -46,7 +41,7 @@ class Rearrangement(NamedTuple):
 
 
 class FeatureLayout(NamedTuple):
-    """Sizes and symmetries of the privileged features and of actions as the side ahead sees them."""
+    """Size and symmetry of the privileged features and of actions."""
 
     size: int
     """D."""
@@ -54,22 +49,8 @@ class FeatureLayout(NamedTuple):
     """Of the features, [D]."""
     mirror_action: Rearrangement
     """Of the actions, [U]."""
-    proprio: Rearrangement
-    """Proprioception as each side sees it, [S, P]."""
-    actuators: NDArray[np.int64]
-    """Order of actuators as each side sees them, [S, U]."""
     holds: int
     """Where it stands that the robot is to hold."""
-
-    def torque_of(self, action: NDArray[np.float32], side: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the torques, [B, U], of actions as the sides ahead see them, [B, U]; `side` is [B]."""
-        torque = np.empty_like(action)
-        np.put_along_axis(torque, self.actuators[side], action, 1)
-        return torque
-
-    def action_of(self, torque: NDArray[np.float32], side: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return torques, [B, U], as the sides ahead see them, [B, U]; `side` is [B]."""
-        return np.take_along_axis(torque, self.actuators[side], 1)
 
 
 _FLIP_Y = (1.0, -1.0)
@@ -80,12 +61,9 @@ _VECTOR, _ROTATION = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)
 @cache
 def feature_layout(body: Body) -> FeatureLayout:
     """Return the layout for a body."""
-    source, sign = (np.array(v) for v in body.symmetry.mirror)
+    source, sign = (np.array(v) for v in body.mirror)
     posture = np.flatnonzero([r is not None for r in body.joint_range])
-    views = [np.array(column) for column in zip(*body.proprio_sides, strict=True)]
-    actuators = np.array([body.of_actuators(order) for order in body.sides], np.int64)
-    acting = np.array(body.of_actuators(body.symmetry.mirror.source), np.int64)
-    acting_sign = sign[[body.joints.index(a.joint) for a in body.actuators]]
+    acting, acting_sign = (np.array(v) for v in body.mirrored_actuators)
     # The order of `privileged_features`: (source, sign) of each block.
     blocks: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = [
         (np.array([np.flatnonzero(posture == s)[0] for s in source[posture]], np.int64), sign[posture]),
@@ -100,9 +78,8 @@ def feature_layout(body: Body) -> FeatureLayout:
         sources.append(start + block)
         start += len(block)
     mirror = Rearrangement(np.concatenate(sources), np.concatenate([s for _, s in blocks]).astype(np.float32))
-    seen = Rearrangement(views[0], views[1].astype(np.float32))
     holds = start - 2 * len(_NEIGHBOURS) - 2  # the last of the goal's kinds, behind which the elapsed time stands
-    return FeatureLayout(start, mirror, Rearrangement(acting, acting_sign.astype(np.float32)), seen, actuators, holds)
+    return FeatureLayout(start, mirror, Rearrangement(acting, acting_sign.astype(np.float32)), holds)
 
 
 def _turn(v: NDArray[np.floating], axis: NDArray[np.float64]) -> NDArray[np.floating]:
@@ -123,26 +100,10 @@ def goal_offsets(world: GoalView) -> NDArray[np.float32]:
     return (np.concatenate([robot, box], 1) / world.body.cell_size).astype(np.float32)
 
 
-def side_ahead(world: GoalView) -> NDArray[np.int64]:
-    """Return which side of each robot looks best along its instruction, in quarter turns to the left, [B].
-
-    With STAY it is the front.
-    """
-    if world.body.symmetry.sides == 1:
-        return np.zeros(world.batch, np.int64)
-    course = OFFSETS_XY[world.goals.direction]
-    angle = np.where(course.any(1), np.arctan2(course[:, 1], course[:, 0]), world.pose[:, 2])
-    return np.rint(wrap_angles(angle - world.pose[:, 2]) / (np.pi / 2)).astype(np.int64) % 4
-
-
-def looks_again(elapsed: NDArray[np.integer], kind: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return where `side_ahead` chooses anew, [B]: when an instruction is new, or has lasted for long and is no push.
-
-    Args:
-        elapsed: Ticks that the instruction in force has had, [B].
-        kind: Its `GoalKind`, [B].
-    """
-    return (elapsed == 0) | ((elapsed % _LOOK_AGAIN == 0) & (kind != GoalKind.PUSH))
+def course_error(world: GoalView) -> NDArray[np.floating]:
+    """Return by how much robots would have to turn to their left to face where they are told to go, [B] radians."""
+    along = INSTRUCTION_AXES[world.goals.direction]
+    return wrap_angles(np.arctan2(along[:, 1], along[:, 0]) - world.pose[:, 2])
 
 
 def rest_position(world: GoalView) -> NDArray[np.float64]:
@@ -154,7 +115,7 @@ def rest_position(world: GoalView) -> NDArray[np.float64]:
 
 
 def privileged_features(
-    world: GoalView, elapsed: NDArray[np.float64], torque: NDArray[np.float32], side: NDArray[np.int64]
+    world: GoalView, elapsed: NDArray[np.float64], torque: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Return the view of critic and teacher, [B, D].
 
@@ -162,15 +123,11 @@ def privileged_features(
         world: Its `goals` are the instructions in force.
         elapsed: Share of the instruction's time limit that has passed, [B].
         torque: Applied in the tick before, [B, U].
-        side: The side ahead, [B]; see `side_ahead`.
     """
     body, goals, rows, size = world.body, world.goals, np.arange(world.batch), world.body.cell_size
-    layout, at = feature_layout(body), body.proprio
-    quarter = side * (np.pi / 2)
-    heading = world.pose[:, 2] + quarter
+    at, felt, heading = body.proprio, world.proprio, world.pose[:, 2]
     ahead = np.stack([np.cos(heading), np.sin(heading)], 1)
-    lane = INSTRUCTION_AXES[goals.direction]
-    felt = layout.proprio.sign[side] * np.take_along_axis(world.proprio, layout.proprio.source[side], 1)
+    lane, error = INSTRUCTION_AXES[goals.direction], course_error(world)
     push = (goals.kind == GoalKind.PUSH)[:, None]
     box = world.box_position[rows, goals.box_index].astype(np.float64)
     to_target = (goals.robot_target - world.pose[:, :2]) / size
@@ -181,11 +138,11 @@ def privileged_features(
     parts = [
         _posture(body, felt),
         felt[:, at.joint_velocity],
-        layout.action_of(torque, side),
+        torque,
         felt[:, at.linear_velocity] / size,
         felt[:, at.angular_velocity],
         felt[:, at.up_axis],
-        _relative_heading(world, heading, lane),
+        np.stack([np.cos(error), np.sin(error)], 1),
         *(_turn(v, ahead) for v in vectors),
         *(_turn(v, lane) for v in vectors[:3]),
         *(np.clip(_NEAR * _turn(v, lane), -1.0, 1.0) for v in (to_target, to_box, box_left, rest_left)),
@@ -198,23 +155,10 @@ def privileged_features(
 
 
 def _posture(body: Body, felt: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the positions of joints that have a range, from -1 to 1 within it, as the side ahead sees them."""
+    """Return the positions of joints that have a range, from -1 to 1 within it,."""
     kept = [j for j, limits in enumerate(body.joint_range) if limits is not None]
     low, high = np.array([limits for limits in body.joint_range if limits is not None]).reshape(-1, 2).T
     return (2.0 * felt[:, body.proprio.joint_position][:, kept] - low - high) / (high - low)
-
-
-def _relative_heading(
-    world: GoalView, heading: NDArray[np.float64], along: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the direction of the instruction seen from the robot, (ahead, left), [B, 2].
-
-    A body with several fronts may stand along any axis of the grid unless it pushes.
-    """
-    error = wrap_angles(np.arctan2(along[:, 1], along[:, 0]) - heading)
-    if world.body.symmetry.sides > 1:
-        error = np.where(world.goals.kind == GoalKind.PUSH, error, wrap_angles(4 * error) / 4)
-    return np.stack([np.cos(error), np.sin(error)], 1)
 
 
 def _surroundings(world: GoalView, along: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import GoalView, drift, rest_position
-from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, OFFSETS_XY, Instruction
-from mujoban_sim.driving import forward_speed, wrap_angles
+from mujoban_controller.goal_features import GoalView, course_error, drift, rest_position
+from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction
+from mujoban_sim.driving import forward_speed
 from mujoban_sim.goals import GoalKind
 
 _REACH = 0.6
@@ -54,7 +54,7 @@ class RewardConfig:
     effort: float = 0.01
     """Cost of the squared change of torques."""
     heading: float = 0.05
-    """Cost of a tick in which no side of the robot looks along the instruction."""
+    """Cost of a tick in which the robot looks the other way than where it is told to go."""
     tilt: float = 0.1
     """Cost of a tick in which the robot lies on its side."""
     turn: float = 5.0
@@ -62,6 +62,9 @@ class RewardConfig:
     action turns it: a gait has to earn more than it costs in torques, also while it is still slow."""
     fastest_turn: float = 2.0
     """Radians per second beyond which turning faster earns no more."""
+    facing: float = 1.0
+    """Weight, in the potential, of each half turn by which a robot that no single action turns faces away from where
+    it is told to go."""
     backwards: float = 0.0
     """Cost of a tick in which the robot moves backwards."""
 
@@ -87,7 +90,10 @@ def potential(world: GoalView, config: RewardConfig) -> NDArray[np.float64]:
     push -= config.lane * np.abs((apart * normal).sum(1))
     push -= config.gap * np.maximum((apart * direction).sum(1) - _REACH, 0.0)
     push -= config.aside * np.maximum(np.abs((left * normal).sum(1)) - 0.02, 0.0)
-    return np.where(goals.kind == GoalKind.PUSH, push, move)
+    near = np.where(goals.kind == GoalKind.PUSH, push, move)
+    if world.body.turn is None:
+        near -= config.facing * np.where(goals.kind == GoalKind.HOLD, 0.0, np.abs(course_error(world)) / np.pi)
+    return near
 
 
 class GoalReward:
@@ -145,10 +151,8 @@ class GoalReward:
         return c.turn * turned * placed * (world.goals.kind == GoalKind.HOLD)
 
     def _off_course(self, world: GoalView) -> NDArray[np.float64]:
-        """Return 0 where a side looks along the instruction, up to 1 halfway between two, [B]."""
-        along = INSTRUCTION_AXES[world.goals.direction]
-        error = wrap_angles(np.arctan2(along[:, 1], along[:, 0]) - world.pose[:, 2])
-        return (1.0 - np.cos(world.body.symmetry.sides * error)) / 2 * (world.goals.kind != GoalKind.HOLD)
+        """Return 0 where the robot looks along the instruction, up to 1 where it looks the other way, [B]."""
+        return (1.0 - np.cos(course_error(world))) / 2 * (world.goals.kind != GoalKind.HOLD)
 
 
 def upright(world: GoalView) -> NDArray[np.float32]:

@@ -20,14 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import (
-    AWAY,
-    feature_layout,
-    goal_offsets,
-    looks_again,
-    privileged_features,
-    side_ahead,
-)
+from mujoban_controller.goal_features import goal_offsets, privileged_features
 from mujoban_controller.goal_rewards import GoalReward, fallen
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.instructions import TerminationNoise, feasible_kinds, random_instruction
@@ -47,7 +40,7 @@ _NO_PLAN = 200
 _ENDLESS = 2.0**62
 """Steps that no episode has; checkpoints hold finite numbers alone."""
 _CHANGING = (
-    "instruction", "terminated", "first", "planned", "torque", "side", "_without_plan", "_start_boxes", "_failures",
+    "instruction", "terminated", "first", "planned", "torque", "_without_plan", "_start_boxes", "_failures",
     "_completed", "_horizon",
 )  # fmt: skip
 """The task's own arrays that change from tick to tick."""
@@ -106,7 +99,6 @@ class GoalTask:
         first: Whether tick t is the first of an episode, bool [B].
         planned: Whether the row follows the planner, bool [B].
         torque: Applied in the tick before, zero on an episode's first, float32 [B, U].
-        side: The side that each robot puts ahead, in quarter turns to the left, int64 [B].
     """
 
     def __init__(
@@ -145,8 +137,6 @@ class GoalTask:
         self.first = np.ones(b, np.bool_)
         self.planned = np.zeros(b, np.bool_)
         self.torque = np.zeros((b, self.world.body.action_size), np.float32)
-        self.side = np.zeros(b, np.int64)
-        self._layout = feature_layout(self.world.body)
         self._reward = GoalReward(config.reward)
         self._without_plan = np.zeros(b, np.int64)
         self._start_boxes = self.world.box_cell.copy()
@@ -156,7 +146,6 @@ class GoalTask:
         self._horizon = np.full(b, _ENDLESS)
         self._begin_episodes(np.arange(b))
         self._issue(np.arange(b))
-        self._turn_sides()
 
     @property
     def elapsed(self) -> NDArray[np.float64]:
@@ -203,11 +192,7 @@ class GoalTask:
 
     def features(self) -> NDArray[np.float32]:
         """Return what critic and privileged teacher see, [B, D]."""
-        return privileged_features(self.world, self.elapsed, self.torque, self.side)
-
-    def torque_of(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the torques, [B, U], of actions in the order in which the side ahead sees them, [B, U]."""
-        return self._layout.torque_of(action, self.side)
+        return privileged_features(self.world, self.elapsed, self.torque)
 
     def observe(self, *, camera: bool = True) -> ControllerInput:
         """Return what controllers see in this tick, ground truth included; without `camera` frames are empty."""
@@ -218,10 +203,6 @@ class GoalTask:
         return ControllerInput(
             self.instruction.copy(), frame, world.proprio.copy(), self.terminated.copy(), truth
         )
-
-    def action_of(self, torque: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return torques, [B, U], in the order in which the side ahead sees them."""
-        return self._layout.action_of(torque, self.side)
 
     def step(self, torque: NDArray[np.float32]) -> TaskStep:
         """Apply torques in [-1, 1], [B, U]; then end instructions and episodes and choose the next ones."""
@@ -251,7 +232,6 @@ class GoalTask:
             self._begin_episodes(np.flatnonzero(over))
         if rows.size:
             self._issue(rows)
-        self._turn_sides()
         return TaskStep(reward, (~(failed | over)).astype(np.float32), over & ~failed, outcomes, episodes)
 
     def _beyond(self, completed: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -263,19 +243,6 @@ class GoalTask:
         resting = world.box_speed[np.arange(world.batch), goals.box_index] < 0.05 * world.body.cell_size
         stuck = (left[:, 0] < -0.02) & (np.hypot(*left.T) > self.config.tolerance) & resting
         return (goals.kind == GoalKind.PUSH) & ((left[:, 0] < -self.config.overshoot) | stuck) & ~completed
-
-    def put_ahead(self, side: NDArray[np.int64]) -> None:
-        """Put the sides ahead, [B], that a policy chooses, where they are less than 60 degrees off the instruction."""
-        angle = self.world.pose[:, 2] + side * (np.pi / 2)
-        # With STAY there is no direction to face, and the product is zero.
-        facing = (OFFSETS_XY[self.instruction] * np.stack([np.cos(angle), np.sin(angle)], 1)).sum(1) > AWAY
-        self.side = np.where(facing, side, self.side)
-
-    def _turn_sides(self) -> None:
-        """Choose the side ahead where it is time to."""
-        again = looks_again(self._noise.elapsed, self.world.goals.kind)
-        if again.any():
-            self.side = np.where(again, side_ahead(self.world), self.side)
 
     def _remember(self, rows: NDArray[np.int64]) -> None:
         """Keep the situations in which the instructions in force began, to be tried again."""

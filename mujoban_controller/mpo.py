@@ -1,7 +1,7 @@
 """MPO in the goal task: a privileged teacher, or the camera policy with an asymmetric critic (paper C.3).
 
 Both learn from windows of a replay. The camera policy's memory at the start of a window is the one that it had when
-the window was played. The critic sees the privileged features, and actions as the side ahead sees them.
+the window was played. The critic sees the privileged features.
 
 Shapes: M windows of a batch, W ticks of a window, n steps of a return, N sampled actions, U actuators, D features.
 """
@@ -17,12 +17,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.goal_features import feature_layout
 from mujoban_controller.play import CRITIC, Batch, CriticDraw, put_on
 from mujoban_controller.policy import GoalPolicy
 from mujoban_controller.privileged import Critic
 from mujoban_controller.product import ProductLearner, Validation
-from mujoban_core.bodies import get_body
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_rl.engine import Scalars, State
 from mujoban_rl.limits import NaNGuard
@@ -170,7 +168,6 @@ class MPOLearner(ProductLearner[Batch]):
         self.loss = MPOLoss(policy.action_size, config.loss).to(policy.device)
         self.target_policy, self.target_critic = deepcopy(policy), deepcopy(self.critic)
         self._average = moving_average(policy, config.average) if config.average else None
-        self._actuators = torch.from_numpy(feature_layout(get_body(body)).actuators).to(policy.device)
         self._policy_adam = torch.optim.Adam(policy.parameters(), config.policy_rate, fused=True)
         self._critic_adam = torch.optim.Adam(self.critic.parameters(), config.critic_rate, fused=True)
         self._dual_adam = self.loss.duals.adam(config.loss.dual_learning_rate)
@@ -261,7 +258,7 @@ class MPOLearner(ProductLearner[Batch]):
         n = self.config.n_step
         mean, scale = batch["mean"][:, n:], batch["scale"][:, n:]
         action = mean + scale * paired_noise(self.config.samples, mean, self._generator)
-        return self.target_critic(batch["features"][:, n:], self._as_seen(action, batch)).mean(0)
+        return self.target_critic(batch["features"][:, n:], action).mean(0)
 
     @torch.no_grad()
     def _draw(self, batch: Batch) -> _Draws:
@@ -269,7 +266,7 @@ class MPOLearner(ProductLearner[Batch]):
         config = self.config
         target = self.target_policy.over_windows(batch, config.n_step)
         action = target.mean + target.scale * paired_noise(config.samples, target.mean, self._generator)
-        q = self.target_critic(batch["features"][:, config.n_step :], self._as_seen(action, batch))
+        q = self.target_critic(batch["features"][:, config.n_step :], action)
         return _Draws(target, action, q)
 
     @torch.no_grad()
@@ -285,13 +282,6 @@ class MPOLearner(ProductLearner[Batch]):
         averages = () if self._average is None else (self._average.module,)
         for policy in (self.policy, self.target_policy, *averages):
             policy.normalise(batch)
-
-    def _as_seen(self, action: Tensor, batch: Mapping[str, Tensor]) -> Tensor:
-        """Return a policy's actions in the last W - n ticks as the side ahead sees them, [N, M, W - n, U]."""
-        if self.policy.acts_ahead or len(self._actuators) == 1:
-            return action
-        order = self._actuators[batch["side"][:, self.config.n_step :]]
-        return action.gather(-1, order.expand(action.shape))
 
     def _critic_loss(self, batch: Mapping[str, Tensor], value: Tensor) -> Tensor:
         """Return the squared error of Q in the first W - n ticks, given V in the last W - n, [M, W - n]."""

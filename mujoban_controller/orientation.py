@@ -1,4 +1,4 @@
-"""Where a body that does not feel its heading faces, and which of its sides it puts ahead.
+"""Where a body that does not feel its heading faces.
 
 The ball's steer joint is its heading. A body on a free root has a gyro alone, whose turns sum up to a heading since the
 start of the episode; how that lies in the map only the frames tell. Lines of floor and walls, which are nearly always
@@ -6,9 +6,7 @@ in view, show it up to quarter turns; which of the four it is the skyline shows,
 stands out above the walls (`skyline`). So a needle is kept, of two hands: what a frame shows is added to them, the
 surer the longer, and they turn with the robot in between.
 
-A body that is alike from all sides needs not turn round: it puts the side ahead that faces where the instruction leads.
-
-Shapes: B robots, M ticks of any robots, F features of a frame, P proprioceptive values, S sides, U actuators.
+Shapes: B robots, M ticks of any robots, F features of a frame, P proprioceptive values.
 """
 
 from __future__ import annotations
@@ -20,10 +18,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.goal_features import feature_layout
 from mujoban_controller.skyline import HEADINGS, Skyline, heading_loss, mean_of, unit
 from mujoban_core.bodies import Body
-from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
+from mujoban_core.grid import CONTROL_PERIOD, turn_to_instruction
 
 NEEDLE: Final = 4
 """Components of the needle: of a hand that points in the heading, along the map's x-axis and its y-axis, and of one
@@ -74,8 +71,7 @@ class Compass(nn.Module):
         first = _REMEMBERED * _turn(first, turned) + _concentration(skyline) * skyline
         second = _KEPT * _turn(second, _QUARTERS * turned) + shown[..., HEADINGS:]
         # The gyro's sum strays by ten degrees within 200 ticks; the lines hold it.
-        heading = heading_of(torch.cat([first, second], -1))
-        return torch.cat([first.norm(dim=-1, keepdim=True) * heading, second], -1)
+        return torch.cat([first.norm(dim=-1, keepdim=True) * _nearest(first, second), second], -1)
 
 
 def sight_loss(shown: Tensor, heading: Tensor) -> Tensor:
@@ -105,55 +101,13 @@ def _angle(vector: Tensor) -> Tensor:
     return torch.atan2(vector[..., 1], vector[..., 0] + _SHORTEST * (vector.detach().abs().sum(-1) < _SHORTEST))
 
 
-def heading_of(needle: Tensor) -> Tensor:
-    """Return the unit vectors in which needles point, [..., 2]: the second hand's nearest to the first."""
-    first, second = needle.split(2, -1)
+def _nearest(first: Tensor, second: Tensor) -> Tensor:
+    """Return the unit vectors, [..., 2], that the second hand may mean and that are nearest to the first."""
     fine = _angle(second) / _QUARTERS
     quarter = math.tau / _QUARTERS
     return unit(fine + quarter * torch.round((_angle(first.detach()) - fine.detach()) / quarter))
 
 
-class Sides(nn.Module):
-    """What a body feels and does, as the side that it puts ahead sees it; nothing is learned."""
-
-    source: Tensor
-    sign: Tensor
-    own: Tensor
-    axes: Tensor
-
-    def __init__(self, body: Body) -> None:
-        """Read the symmetries of a body."""
-        super().__init__()
-        layout = feature_layout(body)
-        order = torch.from_numpy(layout.actuators)
-        self.count = len(order)
-        """S."""
-        self.register_buffer("source", torch.from_numpy(layout.proprio.source), persistent=False)
-        self.register_buffer("sign", torch.from_numpy(layout.proprio.sign), persistent=False)
-        self.register_buffer("own", order.argsort(1), persistent=False)
-        self.register_buffer("axes", torch.tensor(INSTRUCTION_AXES, dtype=torch.float32), persistent=False)
-
-    def ahead(self, heading: Tensor, instruction: Tensor) -> Tensor:
-        """Return the side, in quarter turns to the left, that faces where an instruction leads, int64 [B].
-
-        Args:
-            heading: Unit vectors, [B, 2].
-            instruction: A, int64 [B]; with STAY the front stays ahead.
-        """
-        x, y = self.relative(heading.detach(), instruction, torch.zeros_like(instruction)).unbind(-1)
-        side = torch.round(torch.atan2(y, x) / (math.pi / 2)).long() % self.count
-        return torch.where(instruction == int(Instruction.STAY), 0, side)
-
-    def relative(self, heading: Tensor, instruction: Tensor, side: Tensor) -> Tensor:
-        """Return the direction of instructions as the side ahead sees it, (ahead, left), [M, 2]."""
-        front = turn_to_instruction(*self.axes[instruction].unbind(-1), *heading.unbind(-1))
-        quarter = side * (math.pi / 2)
-        return torch.stack(turn_to_instruction(*front, quarter.cos(), quarter.sin()), -1)
-
-    def felt(self, proprio: Tensor, side: Tensor) -> Tensor:
-        """Return proprioception as the side ahead sees it, [M, P]."""
-        return self.sign[side] * proprio.gather(-1, self.source[side])
-
-    def torques(self, action: Tensor, side: Tensor) -> Tensor:
-        """Return the body's torques, [M, U], of actions in the order in which the side ahead sees them."""
-        return action.gather(-1, self.own[side])
+def heading_of(needle: Tensor) -> Tensor:
+    """Return the unit vectors in which needles point, [..., 2]: their first hand, which the lines have set right."""
+    return functional.normalize(needle[..., :2], dim=-1)

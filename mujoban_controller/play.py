@@ -92,7 +92,7 @@ class PrivilegedPlayer(TaskPlayer):
         """Play one tick."""
         features = self._features
         action = self._policy(torch.from_numpy(features)).sample(self._generator).clamp(-1.0, 1.0).numpy()
-        result = self.task.step(self.task.torque_of(action))
+        result = self.task.step(action)
         self._features = self.task.features()
         kept = {"features": features, "action": action, **_outcome(result)}
         return kept, result.outcomes
@@ -175,9 +175,8 @@ class ExploringPlayer(CameraPlayer):
         self._explore = explore
 
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
-        task = self.task
         torque = drawn_torque(mean, scale, self._explore, self.generator)
-        seen = {"features": task.features(), "side": task.side.copy(), "action": task.action_of(torque)}
+        seen = {"features": self.task.features(), "action": torque}
         return torque, {**seen, "mean": mean.numpy(), "scale": scale.numpy()}
 
 
@@ -191,7 +190,7 @@ def drawn_torque(
     return (mean + torch.maximum(scale, least) * noise).clamp(-1.0, 1.0).numpy()
 
 
-CRITIC_FIELDS = ("features", "side", "action", "reward", "discount", "truncated", "mean", "scale")
+CRITIC_FIELDS = ("features", "action", "reward", "discount", "truncated", "mean", "scale")
 """What a critic learns from that sees no frames; `mean` and `scale` are of the policy that played."""
 CRITIC = "critic/"
 """Begins the names of these fields in a batch, in windows of their own."""

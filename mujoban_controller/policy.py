@@ -21,8 +21,6 @@ class GoalPolicy(nn.Module, ABC):
 
     file_name: ClassVar[str]
     """Of the weights that a run exports, without the ending."""
-    acts_ahead: ClassVar[bool]
-    """Whether its actions are as the side ahead sees them; else they are the body's torques."""
     config: dict[str, Any]
     """Arguments that build it."""
     action_size: int

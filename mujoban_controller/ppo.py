@@ -75,7 +75,7 @@ class Rollout(NamedTuple):
     features: Tensor
     """[T + 1, B, D]."""
     action: Tensor
-    """As the side ahead sees them, not limited, [T, B, U]."""
+    """Not limited, [T, B, U]."""
     log_prob: Tensor
     """[T, B]."""
     reward: Tensor
@@ -118,7 +118,7 @@ class RolloutSource(Source[Rollout]):
         for _ in range(self._length):
             policy = self._policy(features)
             action = policy.sample(self._generator)
-            result = task.step(task.torque_of(action.clamp(-1.0, 1.0).numpy()))
+            result = task.step(action.clamp(-1.0, 1.0).numpy())
             self._summary.add(result.outcomes)
             arrays = (torch.from_numpy(a) for a in (result.reward, result.discount, result.truncated))
             ticks.append((features, action, log_prob(policy, action), *arrays))

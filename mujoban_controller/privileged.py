@@ -42,10 +42,9 @@ def _layers(sizes: tuple[int, ...], last_gain: float) -> nn.Sequential:
 
 
 class PrivilegedPolicy(GoalPolicy):
-    """Policy over torques, as the side ahead sees them, from privileged features; the teacher of the camera policy."""
+    """Policy over torques, from privileged features; the teacher of the camera policy."""
 
     file_name = "teacher"
-    acts_ahead = True
 
     def __init__(self, body: str = "ball", width: int = 128, scale: float = 0.4) -> None:
         """Build the network.
@@ -56,11 +55,11 @@ class PrivilegedPolicy(GoalPolicy):
             scale: Standard deviation of every action before training; the same in all states.
         """
         super().__init__()
-        layout = feature_layout(get_body(body))
+        size = feature_layout(get_body(body)).size
         self.config = {"body": body, "width": width, "scale": scale}
-        self.action_size = layout.actuators.shape[1]
-        self.normaliser = Normaliser(layout.size)
-        self.layers = _layers((layout.size, width, width, self.action_size), 0.01)
+        self.action_size = get_body(body).action_size
+        self.normaliser = Normaliser(size)
+        self.layers = _layers((size, width, width, self.action_size), 0.01)
         self.log_scale = nn.Parameter(torch.full((self.action_size,), math.log(scale)))
 
     def forward(self, features: Tensor) -> Gaussian:
@@ -88,7 +87,7 @@ class PrivilegedPolicy(GoalPolicy):
         return self(seen).mean.clamp(-1.0, 1.0).cpu().numpy()
 
     def _drive(self, task: GoalTask) -> NDArray[np.float32]:
-        return task.torque_of(self.act(task.features()))
+        return self.act(task.features())
 
 
 class Value(nn.Module):
@@ -107,16 +106,16 @@ class Value(nn.Module):
 
 
 class Critic(nn.Module):
-    """Q of privileged features and actions as the side ahead sees them (the asymmetric critic of paper C.3)."""
+    """Q of privileged features and actions (the asymmetric critic of paper C.3)."""
 
     def __init__(self, body: str = "ball", width: int = 128, extra: int = 0) -> None:
         """Build the network for a body; `extra` features stand behind the privileged ones."""
         super().__init__()
-        layout = feature_layout(get_body(body))
+        size = feature_layout(get_body(body)).size + extra
         self.config = {"body": body, "width": width, "extra": extra}
-        self.normaliser = Normaliser(layout.size + extra)
-        self.state = nn.Linear(layout.size + extra, width)
-        self.action = nn.Linear(layout.actuators.shape[1], width, bias=False)
+        self.normaliser = Normaliser(size)
+        self.state = nn.Linear(size, width)
+        self.action = nn.Linear(get_body(body).action_size, width, bias=False)
         self.norm = nn.LayerNorm(width)
         self.hidden = nn.Linear(width, width)
         self.value = nn.Linear(width, 1)

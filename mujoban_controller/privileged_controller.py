@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_controller.goal_features import feature_layout, looks_again, privileged_features, side_ahead
+from mujoban_controller.goal_features import privileged_features
 from mujoban_controller.goal_view import StoredView
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_core.bodies import get_body
@@ -31,13 +31,11 @@ class PrivilegedController(Controller):
         self._policy = policy.eval()
         self.config = policy.config
         self._body = get_body(str(policy.config["body"]))
-        self._layout = feature_layout(self._body)
 
     def initial_memory(self, batch: int) -> Memory:
-        """Return goals of robots without an instruction, elapsed ticks, sides, torques and boxes' places before."""
+        """Return goals of robots without an instruction, elapsed ticks, torques and boxes' places before."""
         return (
             *GoalTracker(batch, cell_size=self._body.cell_size).memory(),
-            np.zeros(batch, np.int64),
             np.zeros(batch, np.int64),
             np.zeros((batch, self._body.action_size), np.float32),
             np.zeros((batch, 2), np.float32),
@@ -45,7 +43,7 @@ class PrivilegedController(Controller):
 
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques, [B, U], and the next memory."""
-        *followed, elapsed, side, torque, before = state
+        *followed, elapsed, torque, before = state
         fresh = inputs.terminated | (followed[1] == GoalKind.NONE)
         goals, truth = follow_goals(inputs, tuple(followed), self._body.cell_size)
         elapsed = np.where(fresh, 0, elapsed)
@@ -59,8 +57,6 @@ class PrivilegedController(Controller):
             self._body, len(rows), goals, inputs.proprio, truth.pose, truth.velocity, truth.box_position, speed,
             cells_of_boxes(truth.box_position, self._body.cell_size), truth.abstract_state[..., WALL] > 0.5,
         )  # fmt: skip
-        side = np.where(looks_again(elapsed, goals.kind), side_ahead(view), side)
-        features = privileged_features(view, elapsed / INSTRUCTION_LIMIT, torque, side)
-        torque = self._layout.torque_of(self._policy.act(features), side)
-        return torque, (*goals.memory(), elapsed + 1, side, torque, box.astype(np.float32))
+        torque = self._policy.act(privileged_features(view, elapsed / INSTRUCTION_LIMIT, torque))
+        return torque, (*goals.memory(), elapsed + 1, torque, box.astype(np.float32))
 

@@ -93,12 +93,7 @@ def turn_view(abstract_state: NDArray[np.float32], body: Body = BALL) -> NDArray
 def walk_view(
     abstract_state: NDArray[np.float32], direction: Instruction, body: Body = BALL
 ) -> NDArray[np.bool_]:
-    """Return which cells a robot sees that has walked into its cell in a direction, by an estimate, [N, N].
-
-    A body that is alike from several sides may look another way: of what it sees nothing is known.
-    """
-    if body.symmetry.sides > 1:
-        return np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
+    """Return which cells a robot sees that has walked into its cell in a direction, by an estimate, [N, N]."""
     here, heading = np.argmax(abstract_state[..., AGENT]), WALK_HEADINGS[[direction]]
     return _views(abstract_state[..., WALL], np.array([here]), body, heading).reshape(GRID_SIZE, GRID_SIZE)
 

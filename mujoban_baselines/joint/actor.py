@@ -19,7 +19,7 @@ from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.joint.stack import DrawingController, DrawingPlanner
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_controller.controller import MEMORY_FIELDS, VisuomotorController
-from mujoban_controller.goal_features import privileged_features, side_ahead
+from mujoban_controller.goal_features import privileged_features
 from mujoban_core.grid import CHANNELS, GRID_SIZE, INSTRUCTION_LIMIT
 from mujoban_core.interfaces import Observation, renew_rows
 from mujoban_core.look_around import look_around
@@ -160,7 +160,7 @@ class JointActor(Actor):
         world = self._task.world
         # The tick in which an instruction is given counts as its first.
         elapsed = (state.termination.elapsed - 1) / INSTRUCTION_LIMIT
-        goal = privileged_features(world, elapsed, self._torque, side_ahead(world))
+        goal = privileged_features(world, elapsed, self._torque)
         return np.concatenate([goal, world.abstract_state().reshape(world.batch, MAP)], 1, dtype=np.float32)
 
     def state(self) -> State:

@@ -19,12 +19,11 @@ from mujoban_core.bodies.body import (
     Relabelling,
     RobotPhysics,
     Servo,
-    Symmetry,
 )
 
 __all__ = [
     "ANT", "BALL", "BODIES", "FIRST_PERSON_CAMERA", "INERTIAL_SIZE", "ROBOT_BODY", "ROBOT_DEFAULTS", "UP_AXIS_SIZE",
-    "Actuator", "Body", "Motor", "ProprioSlices", "Relabelling", "RobotPhysics", "Servo", "Symmetry", "get_body",
+    "Actuator", "Body", "Motor", "ProprioSlices", "Relabelling", "RobotPhysics", "Servo", "get_body",
 ]  # fmt: skip
 
 BODIES: Final[dict[str, Body]] = {body.name: body for body in (BALL, ANT)}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from mujoban_core.bodies.body import FIRST_PERSON_CAMERA, ROBOT_BODY, Body, Relabelling, Servo, Symmetry
+from mujoban_core.bodies.body import FIRST_PERSON_CAMERA, ROBOT_BODY, Body, Relabelling, Servo
 from mujoban_core.camera import CameraMount
 from mujoban_core.grid import TIME_LIMIT
 
@@ -67,9 +67,7 @@ ANT: Final = Body(
     joint_qvel=tuple(range(6, 14)),
     joint_range=((-_HIP_RANGE, _HIP_RANGE), _ANKLE_RANGE) * 4,
     # Legs 0 and 3, 1 and 2 change places, and hips turn the other way.
-    symmetry=Symmetry(
-        Relabelling((6, 7, 4, 5, 2, 3, 0, 1), (-1.0, 1.0) * 4), quarter_turn=(2, 3, 4, 5, 6, 7, 0, 1)
-    ),
+    mirror=Relabelling((6, 7, 4, 5, 2, 3, 0, 1), (-1.0, 1.0) * 4),
     actuators=tuple(
         Servo(joint, 0.0, _HIP_RANGE + _BEYOND, **_SERVO)
         if joint.startswith("hip")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from mujoban_core.bodies.body import FIRST_PERSON_CAMERA, ROBOT_BODY, Body, Motor, Relabelling, Symmetry
+from mujoban_core.bodies.body import FIRST_PERSON_CAMERA, ROBOT_BODY, Body, Motor, Relabelling
 from mujoban_core.camera import CameraMount
 from mujoban_core.grid import TIME_LIMIT
 
@@ -42,7 +42,7 @@ BALL: Final = Body(
     joint_qpos=(4, 3),
     joint_qvel=(4, 3),
     joint_range=(None, None),
-    symmetry=Symmetry(Relabelling((0, 1), (1.0, -1.0))),
+    mirror=Relabelling((0, 1), (1.0, -1.0)),
     actuators=(Motor("roll", 20.0), Motor("steer", 20.0)),
     rest_qpos=(0.0, 0.0, 0.0, 0.0, 0.0),
     cell_size=1.0,

@@ -85,30 +85,12 @@ Actuator = Motor | Servo
 
 
 class Relabelling(NamedTuple):
-    """How a body's joints, or its actuators, look after it was turned or mirrored."""
+    """How a body's joints, or its actuators, look after it was mirrored."""
 
     source: tuple[int, ...]
     """Entry i of the new order is entry `source[i]` of the body's own."""
     sign: tuple[float, ...]
     """Factor of each entry of the new order."""
-
-
-@dataclass(frozen=True)
-class Symmetry:
-    """Which postures of a body are the same for what it can do.
-
-    Attributes:
-        mirror: joints after a reflection at the robot's x-z plane.
-        quarter_turn: joints as seen when the robot's left side is put ahead; None for a body with a single front.
-    """
-
-    mirror: Relabelling
-    quarter_turn: tuple[int, ...] | None = None
-
-    @property
-    def sides(self) -> int:
-        """Number of sides that can be put ahead."""
-        return 1 if self.quarter_turn is None else 4
 
 
 @dataclass(frozen=True)
@@ -183,7 +165,7 @@ class Body:
         joint_qvel: their offsets among the robot's velocities.
         joint_range: their lowest and highest positions [rad]; None for one that turns freely, whose position tells
             nothing of the posture.
-        symmetry: what can be mirrored and turned.
+        mirror: joints after a reflection at the robot's x-z plane.
         actuators: motors or servos in the order of the torque's U components.
         rest_qpos: the robot's positions when it stands at the map's origin and heads east; it settles from there.
         cell_size: edge of a cell in metres; the world is scaled by it, box mass and peg size are not (A.3).
@@ -202,7 +184,7 @@ class Body:
     joint_qpos: tuple[int, ...]
     joint_qvel: tuple[int, ...]
     joint_range: tuple[tuple[float, float] | None, ...]
-    symmetry: Symmetry
+    mirror: Relabelling
     actuators: tuple[Actuator, ...]
     rest_qpos: tuple[float, ...]
     cell_size: float
@@ -233,33 +215,11 @@ class Body:
         return self.proprio.joint_position.start + self.joint_qpos.index(3) if self.root == "slides" else None
 
     @cached_property
-    def sides(self) -> tuple[tuple[int, ...], ...]:
-        """The order of joints in which each side that can be put ahead looks like the front, [S][J]."""
-        orders = [tuple(range(len(self.joints)))]
-        for _ in range(self.symmetry.sides - 1):
-            turn = self.symmetry.quarter_turn or orders[0]
-            orders.append(tuple(turn[i] for i in orders[-1]))
-        return tuple(orders)
-
-    @property
-    def proprio_sides(self) -> tuple[Relabelling, ...]:
-        """How proprioception looks with each side ahead, in quarter turns to the left, [S] relabellings of P values."""
-        part, views = self.proprio, []
-        for side, joints in enumerate(self.sides):
-            source, sign = list(range(part.size)), [1.0] * part.size
-            for vector in (part.linear_velocity, part.angular_velocity, part.linear_acceleration, part.up_axis):
-                x, y = vector.start, vector.start + 1
-                source[x], source[y] = (x, y) if side % 2 == 0 else (y, x)
-                sign[x], sign[y] = ((1.0, 1.0), (1.0, -1.0), (-1.0, -1.0), (-1.0, 1.0))[side]
-            for angles in (part.joint_position, part.joint_velocity):
-                source[angles] = [angles.start + joint for joint in joints]
-            views.append(Relabelling(tuple(source), tuple(sign)))
-        return tuple(views)
-
-    def of_actuators(self, source: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the order of actuators that goes with an order of joints."""
+    def mirrored_actuators(self) -> Relabelling:
+        """Actuators after the reflection that `mirror` tells of joints."""
+        source, sign = self.mirror
         joints = [self.joints.index(a.joint) for a in self.actuators]
-        return tuple(joints.index(source[j]) for j in joints)
+        return Relabelling(tuple(joints.index(source[j]) for j in joints), tuple(sign[j] for j in joints))
 
     @property
     def qpos_size(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from mujoban_core.bodies import ANT, Body, Motor, Relabelling, Symmetry
+from mujoban_core.bodies import ANT, Body, Motor, Relabelling
 
 CART = Body(
     name="cart",
@@ -13,7 +13,7 @@ CART = Body(
     joint_qpos=(7, 8),
     joint_qvel=(6, 7),
     joint_range=(None, None),
-    symmetry=Symmetry(Relabelling((1, 0), (1.0, 1.0))),
+    mirror=Relabelling((1, 0), (1.0, 1.0)),
     actuators=(Motor("left", 0.5), Motor("right", 0.5)),
     rest_qpos=(0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     cell_size=0.5,

@@ -131,10 +131,6 @@ def test_a_robot_has_seen_what_lies_ahead_of_where_it_walked(direction, room, be
     assert seen[5:7, 3].all() == room and seen[1:4, 3].all() == behind
 
 
-def test_a_body_that_is_alike_from_all_sides_may_have_looked_another_way():
-    assert not walk_view(estimate(*ROOM), Instruction.EAST, ANT).any()
-
-
 def test_no_second_look_at_what_was_in_view_on_a_walk():
     class Wanderer(Scout):
         """Walks east once, and notes what it is told was in view."""

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rooms import FIRST, ROOM, SECOND, START, TARGETS, put, random_run, rest, room_world
 
-from mujoban_core.bodies import BALL, BODIES, Motor, Relabelling, Symmetry
+from mujoban_core.bodies import BALL, BODIES, Motor, Relabelling
 from mujoban_core.grid import AGENT, BOX, TARGET, WALL, Instruction, cell_to_xy, xy_to_cell
 from mujoban_sim.checks import TorqueError
 from mujoban_sim.goals import GoalKind
@@ -298,7 +298,7 @@ def test_another_body_needs_no_more_than_its_description(monkeypatch):
     </body>"""
     sled = dataclasses.replace(
         BALL, name="sled", root="free", joints=("arm",), joint_qpos=(7,), joint_qvel=(6,),
-        joint_range=(None,), symmetry=Symmetry(Relabelling((0,), (-1.0,))),
+        joint_range=(None,), mirror=Relabelling((0,), (-1.0,)),
         actuators=(Motor("arm", 10.0),), rest_qpos=(0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0, 0.0), cell_size=3.0,
         time_limit=9600, mjcf=mjcf,
     )  # fmt: skip
