@@ -155,7 +155,7 @@ def privileged_features(
 
 
 def _posture(body: Body, felt: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the positions of joints that have a range, from -1 to 1 within it,."""
+    """Return the positions of joints that have a range, from -1 to 1 within it."""
     kept = [j for j, limits in enumerate(body.joint_range) if limits is not None]
     low, high = np.array([limits for limits in body.joint_range if limits is not None]).reshape(-1, 2).T
     return (2.0 * felt[:, body.proprio.joint_position][:, kept] - low - high) / (high - low)

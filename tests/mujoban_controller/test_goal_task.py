@@ -10,7 +10,7 @@ import pytest
 from mujoban_controller.drivers import ControllerDriver
 from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_features import feature_layout
-from mujoban_controller.goal_rewards import GoalReward, RewardConfig
+from mujoban_controller.goal_rewards import GoalReward, RewardConfig, potential
 from mujoban_controller.goal_settings import GoalTaskConfig, judging_config
 from mujoban_controller.goal_task import GoalTask
 from mujoban_controller.instructions import EXACT, InstructionConfig
@@ -229,6 +229,23 @@ def test_to_turn_is_rewarded_where_no_single_action_does_it():
     most = RewardConfig().turn * CONTROL_PERIOD
     for off, share in ((0.0, 1.0), (0.15, 0.5), (0.5, 0.0)):
         assert turning_is_worth("ant", off) == pytest.approx(np.full(4, share * most), abs=1e-5)
+
+
+@pytest.mark.parametrize("body", ["ball", "ant"])
+def test_facing_where_it_is_told_to_go_counts_for_a_body_that_no_single_action_turns(body):
+    task = make(body=body, planned=1.0, astray=0.0, misaligned=0.0)
+    world, config, near = task.world, RewardConfig(), []
+    rows = np.flatnonzero(world.goals.kind != GoalKind.HOLD)
+    along = OFFSETS_XY[world.goals.direction]
+    for off in (0.0, np.pi / 2, -np.pi / 2, np.pi):
+        pose = world.pose.astype(np.float64)
+        pose[:, 2] = np.arctan2(along[:, 1], along[:, 0]) + off
+        world.place(np.arange(world.batch), pose, world.box_position)
+        near.append(potential(world, config)[rows])
+    worth = config.facing if body == "ant" else 0.0
+    assert rows.size and np.array([near[0] - n for n in near]) == pytest.approx(
+        worth * np.repeat([[0.0], [0.5], [0.5], [1.0]], rows.size, 1), abs=0.02
+    )
 
 
 @pytest.mark.parametrize(("stays_on", "least", "most"), [(1.0, 1.0, 1.0), (0.0, 0.0, 0.5)])
