@@ -139,7 +139,7 @@ def test_a_learned_scout_plays_and_is_named_by_its_weights(tmp_path):
     path, weights = tmp_path / "report.json", tmp_path / "explorer.safetensors"
     explorer = Explorer(8, 1)
     save_weights(weights, explorer, explorer.config, {})
-    options = ["--difficulty", "1", "--time-limit", "90", "--seed", "5000007"]
+    options = ["--difficulty", "1", "--episodes", "2", "--time-limit", "90", "--seed", "5000007"]
     oracles = ["--oracle", "planner,controller,termination"]
     assert evaluate.main([*options, *oracles, "--scout", str(weights), "--json", str(path)]) == 0
     assert json.loads(path.read_text())["weights"]["scout"] == digest(weights)
