@@ -172,7 +172,7 @@ class BagTicks(Iterator[Fields]):
         for ticks in episodes(bag, TOPICS):
             if len(ticks) > 1:
                 fields = transitions(ticks, self._config)
-                yield fields if self._teacher is None else fields | {"label": labels(self._teacher, fields)}
+                yield fields if self._teacher is None else fields | {"label": self._teacher.act(fields["features"])}
 
     @torch.no_grad()
     def __next__(self) -> Fields:
@@ -212,11 +212,6 @@ def _check_about(bag: Bag, config: GoalTaskConfig) -> None:
     for what, expected in (("body", config.body), ("world", config.world)):
         if (found := bag.about.get(what, expected)) != expected:
             raise BagError(f"{bag.path}: recorded with the {what} {found}, expected {expected} (--task.{what})")
-
-
-def labels(teacher: PrivilegedPolicy, fields: Fields) -> NDArray[np.float32]:
-    """Return the torques that a teacher would have applied in the ticks of an episode, [L - 1, U]."""
-    return teacher.act(fields["features"])
 
 
 class BagPlayer(Player):
