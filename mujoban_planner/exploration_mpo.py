@@ -108,9 +108,7 @@ class ExplorerActor(SequenceActor):
         return {**kept, "terminated": step.complete, "dropped": cut}, {"reward": step.reward.tolist()}
 
 
-def judge_scout(
-    scout: Scout, reward: ExplorationReward, levels: int = _JUDGED, difficulty: int = 5
-) -> dict[str, float]:
+def judge_scout(scout: Scout, reward: ExplorationReward, levels: int, difficulty: int = 5) -> dict[str, float]:
     """Let a scout explore validation levels; return averages over them.
 
     `found` is the share of what can be seen and the first turn has not shown; `steps` and `looks` are the instructions
@@ -164,7 +162,7 @@ class ExplorerLearner(DiscreteMPOLearner):
 
     def evaluate(self) -> dict[str, float]:
         """Return what the target network gets to see of validation levels, and what the scripted scout does."""
-        learned, scripted = judge_scout(self.target, self._reward), judge_scout(ScriptedScout(), self._reward)
+        learned, scripted = (judge_scout(scout, self._reward, _JUDGED) for scout in (self.target, ScriptedScout()))
         return learned | {f"scripted/{name}": value for name, value in scripted.items()}
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:

@@ -116,7 +116,7 @@ def play_graph(ros):
     running = []
 
     def start(stack=ORACLES, episodes=None, **options):
-        running.append(Play(stack, episodes or Episodes(1, 0, difficulty=2), **options))
+        running.append(Play(stack, episodes or Episodes(1, 47, difficulty=2), **options))
         return running[-1]
 
     yield start

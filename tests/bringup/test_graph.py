@@ -162,7 +162,7 @@ def test_every_node_says_on_diagnostics_how_it_is(play_graph):
 
 
 def test_processes_that_are_killed_are_started_again(ros, oracles):
-    episodes = Episodes(1, 0, difficulty=2)
+    episodes = Episodes(1, 47, difficulty=2)
     parameters = graph_parameters(oracles, episodes)
     with InProcess(parameters, ()) as graph, Processes(parameters) as processes:
         monitor = graph.add(MonitorNode(episodes))
@@ -179,7 +179,7 @@ def test_processes_that_are_killed_are_started_again(ros, oracles):
         processes.kill("simulator", signal.SIGKILL)
         spin_until(monitor.finished.done)
         assert processes.restarts == {"controller": 1, "simulator": 1}
-        assert monitor.results[0].solved and monitor.results[0].seed == 0
+        assert monitor.results[0].solved and monitor.results[0].seed == 47
 
 
 def test_pause_holds_the_world_and_step_advances_it_by_one_tick(play_graph):
@@ -204,7 +204,7 @@ def test_reset_starts_the_same_episode_again(play_graph):
     graph.spin_until(lambda: graph.simulator.ticks >= 20)
     assert graph.call(Trigger, "/reset", Trigger.Request()).success
     (result,) = graph.finish()
-    assert result.solved and result.seed == 0
+    assert result.solved and result.seed == 47
     episodes = graph.said.episodes.values()
     assert [e.episode for e in episodes if e.step == 0] == [1, 2]
     assert len({(e.seed, e.level) for e in episodes}) == 1
@@ -302,7 +302,7 @@ def test_in_real_time_the_latest_torque_is_held_for_a_few_ticks_until_the_clock_
 
 
 def test_real_time_keeps_to_the_clock(play_graph):
-    graph = play_graph(episodes=Episodes(1, 0, difficulty=2), realtime=2.0, time_limit=80)
+    graph = play_graph(episodes=Episodes(1, 47, difficulty=2), realtime=2.0, time_limit=80)
     graph.spin_until(lambda: graph.simulator.ticks >= 1)
     start, ticks = time.monotonic(), graph.simulator.ticks
     graph.finish()

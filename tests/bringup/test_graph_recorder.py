@@ -134,5 +134,5 @@ def test_what_a_bag_in_real_time_lacks_is_in_the_outcome(oracles, tmp_path, monk
 
     monkeypatch.setattr(ControllerNode, "step", now_and_then)
     options = PlayOptions(record=tmp_path / "bag", realtime=4.0, time_limit=12)
-    counts = play(oracles, Episodes(1, 0, difficulty=2), options).counts
+    counts = play(oracles, Episodes(1, 47, difficulty=2), options).counts
     assert counts["recorder: /torque not recorded"] >= 3

@@ -58,7 +58,7 @@ def test_an_occupancy_grid_begins_in_the_south_west():
 
 
 def test_standard_tools_see_the_layers_and_the_scene(play_graph):
-    episodes = Episodes(1, 0, difficulty=2)
+    episodes = Episodes(1, 47, difficulty=2)
     level = episodes[0].level.abstract_state()
     graph = play_graph(episodes=episodes)
     listener = graph.graph.add(Listener())

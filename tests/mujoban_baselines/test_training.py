@@ -254,10 +254,10 @@ def test_v_trace_learns_to_walk_to_the_red_square_from_nothing():
     unroll = VTraceTrainingConfig(unroll=10, rate=3e-3, gamma=0.9)
     config = VTraceRunConfig(task=TaskConfig(robots=16), vtrace=unroll)
     learner, source = vtrace_parts(config, Informed, ActorOptions(), partial(TellingSquares, batch=16))
-    for update in range(200):
+    for update in range(100):
         source.publish(learner.weights(), update)
         learner.update(source.next_batch(), update / 400, NaNGuard())
-        if update == 100:
+        if update == 60:
             source.statistics()
     assert source.statistics()["solved"] > 0.8, "by chance half of the squares that are reached are red"
 
@@ -288,11 +288,11 @@ def test_mpo_learns_to_walk_to_the_red_square_from_nothing():
     source = ActorSource(
         ActorOptions().pool(factory), store, steps_per_update=settings.steps_per_update, first_steps=settings.first
     )
-    for update in range(400):
+    for update in range(350):
         if update % 2 == 0:
             source.publish(learner.weights(), update)
         learner.update(source.next_batch(), update / 400, NaNGuard())
-        if update == 350:
+        if update == 300:
             source.statistics()
     assert source.statistics()["solved"] > 0.7, "by chance half of the squares that are reached are red"
 

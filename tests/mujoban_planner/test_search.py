@@ -29,8 +29,8 @@ def planner():
 
 
 def test_solutions_found_are_solutions_within_the_move_limit(planner):
-    levels = generate_batch(3, range(20))
-    found = search(planner, bit_boards(levels), expansions=400, limit=60)
+    levels = generate_batch(3, range(10))
+    found = search(planner, bit_boards(levels), expansions=300, limit=60)
     solved = 0
     for i, instructions in enumerate(found.instructions):
         if not len(instructions):
@@ -43,7 +43,7 @@ def test_solutions_found_are_solutions_within_the_move_limit(planner):
             boxes, player = result.boxes, result.player
         assert result.solved
         solved += 1
-    assert solved >= 15
+    assert solved >= 7
 
 
 def test_look_ahead_solves_what_the_policy_alone_does_not(planner):

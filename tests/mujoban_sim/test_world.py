@@ -140,7 +140,7 @@ def test_a_bad_torque_is_rejected_and_nothing_moves(bad):
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_random_torques_never_throw_anything_out_of_the_grid(name):
-    batch, steps = 64, 400
+    batch, steps = 64, 250
     world = World(batch, world=name, time_limit=10**9)
     levels = generate_levels(5, range(batch))
     world.reset(np.arange(batch), [EpisodeSpec(level, i) for i, level in enumerate(levels)])
