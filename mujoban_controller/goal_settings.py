@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 from mujoban_controller.goal_rewards import RewardConfig
 from mujoban_controller.instructions import EXACT, InstructionConfig, TerminationConfig
+from mujoban_core.bodies import get_body
 from mujoban_core.grid import COMPLETION_TOLERANCE, DIFFICULTIES
-from mujoban_core.ranges import check_counts, check_shares
+from mujoban_core.ranges import check_counts, check_not_negative, check_shares
 from mujoban_sim.presets import DEFAULT_WORLD, get_world
 
 
@@ -31,6 +32,9 @@ class GoalTaskConfig:
     horizon: float = 300.0
     """Mean steps of an episode, exponentially distributed. Short ones show more levels and appearances, without
     which a camera policy knows the warehouses that it is in by heart; `inf` goes on until the level is solved."""
+    look: int = 0
+    """Ticks at an episode's start in which the robot is told to stay and turns, as in a look around (see
+    `Body.look_ticks`). Who does not feel its heading may know it but for quarter turns until it has seen the sky."""
     retry: float = 0.0
     """Share of episodes that begin where a feasible instruction failed before, in the same appearance. Failures get
     rare long before they are few enough, and the same one then comes again and again in the level that has it."""
@@ -55,6 +59,7 @@ class GoalTaskConfig:
         get_world(self.world)
         check_counts(self, "batch", "patience")
         check_shares(self, "planned", "astray", "retry", "misaligned", "robot_offset", "box_offset")
+        check_not_negative(self, "look")
         for name in ("horizon", "overshoot"):  # `inf` is never
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}: expected a number above 0")
@@ -69,8 +74,10 @@ def judging_config(
 ) -> GoalTaskConfig:
     """Return the settings under which controllers are judged: exact signals and the planner's instructions.
 
-    Without `plans` they are random ones of every kind, and an episode ends after 1,000 steps on average.
+    Who does not feel its heading begins with a look around. Without `plans` they are random ones of every kind, and an
+    episode ends after 1,000 steps on average.
     """
+    layout = get_body(body)
     return GoalTaskConfig(
         batch=batch,
         body=body,
@@ -80,6 +87,7 @@ def judging_config(
         planned=float(plans),
         astray=0.0,
         horizon=math.inf if plans else 1000.0,
+        look=0 if layout.heading_index is not None else layout.look_ticks,
         misaligned=0.0,
         overshoot=math.inf,
         patience=12,

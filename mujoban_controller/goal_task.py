@@ -356,9 +356,12 @@ class GoalTask:
                 )
         issued = np.zeros(world.batch, np.bool_)
         issued[rows] = True
+        looked = world.steps - self._noise.elapsed < self.config.look
         if world.body.turn is None:
             goes_on = self._rng.random(world.batch) < self.config.instructions.stays_on
-            self.instruction[issued & ~self.first & (previous == Instruction.STAY) & goes_on] = Instruction.STAY
+            goes_on &= ~self.first & (previous == Instruction.STAY) & ~looked
+            self.instruction[issued & goes_on] = Instruction.STAY
+        self.instruction[issued & (world.steps < self.config.look)] = Instruction.STAY
         world.instruct(self.instruction, issued)
         self._start_boxes[rows] = world.box_cell[rows]
         self._noise.issue(rows)

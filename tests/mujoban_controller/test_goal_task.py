@@ -262,3 +262,15 @@ def test_a_body_that_learns_to_turn_is_told_to_stay_for_long(stays_on, least, mo
         going_on = stay & task.terminated
         after += (task.instruction == Instruction.STAY)[going_on].tolist()
     assert len(after) > 3 and least <= np.mean(after) <= most
+
+
+def test_an_episode_begins_with_a_look_around_after_which_the_plan_is_followed():
+    task = make(
+        GoalTaskConfig(batch=16, difficulty=1), body="ant", planned=1.0, astray=0.0, misaligned=0.0, horizon=np.inf,
+        look=12, terminations=EXACT,
+    )  # fmt: skip
+    stays = []
+    for _ in range(20):
+        stays.append((task.instruction == Instruction.STAY).mean())
+        play(task, 1, lambda task: np.zeros((16, task.world.body.action_size), np.float32))
+    assert stays[:12] == [1.0] * 12 and stays[-1] == 0.0
