@@ -29,12 +29,12 @@ from torch.nn import functional
 
 from mujoban_controller.drivers import ControllerDriver, Driver
 from mujoban_controller.orientation import NEEDLE, Compass, heading_of
-from mujoban_controller.place import PLACE, Place, phases_along
+from mujoban_controller.place import PLACE, WAY, Place, phases_along, way_left
 from mujoban_controller.policy import GoalPolicy
 from mujoban_controller.skyline import unit
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, Instruction, turn_to_instruction
+from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, OFFSETS_XY, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
 from mujoban_rl.compiled import Compilable
 from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder, gaussian, gaussian_layers, rows_of_sky
@@ -45,6 +45,8 @@ INPUT_FIELDS = TICK
 MEMORY_FIELDS = ("memory0", "memory1", "memory2")
 """Its memory before a tick, `Recurrent`."""
 _CLIP = 5.0
+_NEAR = 4.0
+"""How much closer the way is looked at at its end."""
 _TRACK = 7
 _NEEDLE = _TRACK + NEEDLE
 
@@ -66,33 +68,33 @@ def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
     return Recurrent(*(batch[name][:, 0] for name in MEMORY_FIELDS))
 
 
-def dead_reckoning(track: Tensor, velocity: Tensor, heading: Tensor, terminated: Tensor, period: float) -> Tensor:
+def dead_reckoning(track: Tensor, velocity: Tensor, moved: Tensor, terminated: Tensor) -> Tensor:
     """Return the track after one more tick, [B, 7].
 
     It holds the displacement since the instruction in force began (2), that during the instruction before (2), the
-    velocity of this tick (2), all in the frame of `heading`, and whether there is one (1).
+    velocity of this tick (2), all in the map's frame, and whether there is one (1).
 
     Args:
         track: Before the tick, [B, 7]; zeros at an episode's start.
-        velocity: In the robot's frame in cells per second, [B, 2].
-        heading: Unit vector in which the robot faces, [B, 2].
+        velocity: In the map's frame in cells per second, [B, 2].
+        moved: What `displacement` says, [B, 2].
         terminated: Whether a new instruction begins with this tick, [B].
-        period: Seconds of a tick.
     """
-    moved, before, known = track[:, :2], track[:, 2:4], track[:, 6:]
-    cos, sin = heading.unbind(-1)
-    now = torch.stack(
-        [velocity[:, 0] * cos - velocity[:, 1] * sin, velocity[:, 0] * sin + velocity[:, 1] * cos], -1
-    )
-    moved = moved + displacement(track, now, period)
+    since, before, known = track[:, :2] + moved, track[:, 2:4], track[:, 6:]
     new = terminated[:, None]
-    before = torch.where(new, moved, before)
-    moved = torch.where(new, torch.zeros_like(moved), moved)
-    return torch.cat([moved, before, now, torch.ones_like(known)], -1)
+    before = torch.where(new, since, before)
+    since = torch.where(new, torch.zeros_like(since), since)
+    return torch.cat([since, before, velocity, torch.ones_like(known)], -1)
 
 
 def displacement(track: Tensor, velocity: Tensor, period: float) -> Tensor:
-    """Return how far a robot came since the tick before, [B, 2], given the track then and its velocity now, [B, 2]."""
+    """Return how far a robot came since the tick before, [B, 2].
+
+    Args:
+        track: Before the tick, [B, 7].
+        velocity: In the map's frame in cells per second, [B, 2].
+        period: Seconds of a tick.
+    """
     last, known = track[:, 4:6], track[:, 6:]
     # Trapezoidal rule; an episode's first tick has nothing to come from.
     return 0.5 * period * (velocity + last) * known
@@ -140,6 +142,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
 
     file_name = "controller"
     axes: Tensor
+    steps: Tensor
     proprio_mean: Tensor
     proprio_scale: Tensor
 
@@ -150,6 +153,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         features: int = 256,
         hidden: int = 192,
         place: bool = False,
+        way: bool = False,
     ) -> None:
         """Build the network for a body.
 
@@ -159,14 +163,19 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             features: F, width of the fully connected layers.
             hidden: H, width of the LSTM.
             place: Keep where the robot is within its cell. Weights without a word about it do not.
+            way: Work out from it and from dead reckoning how far it is to where the instruction leads; dito.
 
         Raises:
-            ValueError: If the body is unknown, or the widths are not what `frame_encoder` takes.
+            ValueError: If the body is unknown, the widths are not what `frame_encoder` takes, or there is no place for
+                a way to begin at.
         """
         super().__init__()
         layout = get_body(body)
+        if way and not place:
+            raise ValueError("way without place: how far it is follows from where it is; expected both")
         self.config = {
             "body": body, "channels": list(channels), "features": features, "hidden": hidden, "place": place,
+            "way": way,
         }  # fmt: skip
         self.body = body
         self.mixed_precision = False
@@ -178,11 +187,12 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         self.cell_size = layout.cell_size
         self.register_buffer("axes", torch.tensor(INSTRUCTION_AXES, dtype=torch.float32), persistent=False)
         self.compass = Compass(layout, features) if self.heading_index is None else None
-        self.place = Place(features) if place else None
+        self.register_buffer("steps", torch.tensor(OFFSETS_XY, dtype=torch.float32), persistent=False)
+        self.place, self.way = Place(features) if place else None, way
         # Where the heading is felt, joint positions are replaced by two sine-cosine pairs; else where the instruction
         # leads is told, as the robot sees it. A is one-hot, beta one bit.
         angles = 3 * self.joints if self.compass is None else 2
-        inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1 + PLACE * place
+        inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1 + PLACE * place + WAY * way
         shrink = 2 ** (len(channels) - 1)
         # Who does not feel the heading has to look at the skyline.
         self.first_row = rows_of_sky(layout.camera, shrink) if self.compass is None else 0
@@ -230,17 +240,17 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             track: Before the tick; zeros at an episode's start.
             shown: What the frame shows.
         """
-        velocity = proprio[:, self.part.planar_velocity] / self.cell_size
         before = track[:, :_TRACK]
         if self.compass is None or shown.heading is None:
             heading, needles = unit(proprio[:, self.heading_index]), []
         else:
             needles = [self.compass(shown.heading, proprio, track[:, _TRACK:_NEEDLE])]
             heading = heading_of(*needles)
-        reckoned = dead_reckoning(before, velocity, heading, terminated, CONTROL_PERIOD)
-        parts = [reckoned, *needles]
+        ahead, left = (proprio[:, self.part.planar_velocity] / self.cell_size).split(1, -1)
+        velocity = torch.cat(turn_to_instruction(ahead, left, heading[:, :1], -heading[:, 1:]), -1)
+        moved = displacement(before, velocity, CONTROL_PERIOD)
+        parts = [dead_reckoning(before, velocity, moved, terminated), *needles]
         if self.place is not None and shown.place is not None:
-            moved = displacement(before, reckoned[:, 4:6], CONTROL_PERIOD)
             parts.append(self.place(shown.place, heading, moved, track[:, -PLACE:]))
         return torch.cat(parts, -1)
 
@@ -268,6 +278,10 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         parts += turn_to_instruction(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), x, y)
         if self.place is not None:
             parts.append(phases_along(track[:, -PLACE:], torch.cat([x, y], -1)))
+        if self.way:
+            way = way_left(track[:, -PLACE:], track[:, :2], self.steps[instruction])
+            way = torch.cat(turn_to_instruction(way[:, :1], way[:, 1:], x, y), -1)
+            parts += [way.clamp(-2, 2), (_NEAR * way).clamp(-1, 1)]
         parts += [functional.one_hot(instruction, len(Instruction)), terminated[:, None]]
         return self.body_encoder(torch.cat([p.to(proprio.dtype) for p in parts], -1))
 

@@ -22,6 +22,8 @@ from mujoban_core.grid import turn_to_instruction
 
 PLACE: Final = 4
 """Components of the needles: cosines of the phases along two axes, then their sines; zero in the middle of a cell."""
+WAY: Final = 4
+"""Components of `way_left`."""
 _KEPT: Final = 0.95
 """Share of the needles that stays from tick to tick."""
 
@@ -49,6 +51,22 @@ class Place(nn.Module):
         ahead = _axis_ahead(heading.detach())
         back = torch.stack([ahead[..., 0], -ahead[..., 1]], -1)
         return _KEPT * carried + (1.0 - _KEPT) * phases_along(shown, back)
+
+
+def way_left(place: Tensor, since: Tensor, step: Tensor) -> Tensor:
+    """Return the way to the middle of the cell to which the instruction leads, along x and y of the map, [B, 2] cells.
+
+    A needle says where a robot is in some cell, not in which: it counts from the cell in whose bounds it was when the
+    instruction began. No gradient passes: what a frame shows is learned from poses.
+
+    Args:
+        place: The needles, [B, `PLACE`].
+        since: Displacement since the instruction began, in the map's frame in cells, [B, 2].
+        step: To the next cell as the instruction says, in the map's frame in cells, [B, 2].
+    """
+    cosine, sine = place.detach().split(2, -1)
+    start = torch.atan2(sine, cosine) / math.tau - since
+    return step - since - (start - start.round())
 
 
 def _axis_ahead(heading: Tensor) -> Tensor:

@@ -65,6 +65,8 @@ class NetworkConfig:
     hidden: int = 192
     place: bool = True
     """Whether it keeps where the robot is within its cell."""
+    way: bool = True
+    """Whether it works out from that how far it is to where the instruction leads."""
 
 
 @dataclass(frozen=True)
@@ -260,7 +262,7 @@ class _Parts:
         if config.initial is not None:
             policy = load_weights(VisuomotorController, config.initial, body=config.task.body)
         else:
-            policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden, n.place)
+            policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden, n.place, n.way)
         policy.mixed_precision = True
         return policy.to(self.device).train()
 

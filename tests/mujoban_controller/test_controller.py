@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mujoban_controller.controller import VisuomotorController, dead_reckoning
+from mujoban_controller.controller import Sight, VisuomotorController
 from mujoban_core.bodies import BALL, INERTIAL_SIZE
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
@@ -122,17 +122,20 @@ def test_every_instruction_looks_the_same_to_a_robot_that_faces_along_it(control
     assert torque == pytest.approx(np.repeat(torque[:1], 4, axis=0), abs=1e-5)
 
 
-def test_dead_reckoning_follows_a_drive_round_a_corner():
-    # Two seconds east at 1 m/s, then on the spot to the north, then one second north; velocities in the robot's frame.
-    velocity = torch.tensor([[1.0, 0.0]] * 41 + [[0.0, 0.0]] + [[1.0, 0.0]] * 21)
-    heading = torch.tensor([[1.0, 0.0]] * 42 + [[0.0, 1.0]] * 21)
+def test_dead_reckoning_follows_a_drive_round_a_corner(controller):
+    # Two seconds ahead at a cell per second, facing east; then on the spot to the north, then one second ahead.
+    ahead = torch.tensor([1.0] * 41 + [0.0] + [1.0] * 21)
+    steer = torch.tensor([0.0] * 42 + [np.pi / 2] * 21)
+    proprio = torch.zeros(len(ahead), BALL.proprio_size)
+    proprio[:, BALL.proprio.planar_velocity][:, 0] = ahead * controller.cell_size
+    proprio[:, INERTIAL_SIZE + BALL.joints.index("steer")] = steer
     track = torch.zeros(1, 7)
-    for t in range(len(velocity)):
-        beta = torch.tensor([t == 41])
-        track = dead_reckoning(track, velocity[t : t + 1], heading[t : t + 1], beta, 0.05)
-    moved, before = track[0, :2].tolist(), track[0, 2:4].tolist()
-    assert moved == pytest.approx([0.0, 1.025], abs=1e-4)
+    for t in range(len(ahead)):
+        track = controller.reckon(proprio[t : t + 1], torch.tensor([t == 41]), track, Sight(None, None))
+    since, before, velocity = track[0, :2].tolist(), track[0, 2:4].tolist(), track[0, 4:6].tolist()
+    assert since == pytest.approx([0.0, 1.025], abs=1e-4)
     assert before == pytest.approx([2.025, 0.0], abs=1e-4)
+    assert velocity == pytest.approx([0.0, 1.0], abs=1e-4)
 
 
 def test_weights_survive_a_round_trip_and_damage_is_noticed(controller, tmp_path):

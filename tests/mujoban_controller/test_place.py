@@ -9,7 +9,7 @@ import torch
 
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
-from mujoban_controller.place import PLACE, Place, cells_off, phases, phases_along, place_loss
+from mujoban_controller.place import PLACE, Place, cells_off, phases, phases_along, place_loss, way_left
 from mujoban_core.bodies import ANT, BALL
 
 POSES = torch.tensor(
@@ -62,11 +62,26 @@ def test_phases_along_an_instruction_are_those_of_the_place_turned_with_it(axis)
     torch.testing.assert_close(phases_along(phases(POSES, 1.0), axis), phases(turned, 1.0), atol=1e-5, rtol=0.0)
 
 
+@pytest.mark.parametrize("step", [[0.0, 0.0], [1.0, 0.0], [0.0, -1.0]])
+def test_the_way_left_is_the_way_to_the_cell_beside_that_in_which_the_instruction_began(step) -> None:
+    began, since = torch.tensor([[1.8, -0.1]]), torch.tensor([[0.55, -0.55], [-0.9, 0.3], [0.0, 0.0]])
+    place = phases(began + since, 1.0).requires_grad_()
+    way = way_left(place, since, torch.tensor([step]))
+    torch.testing.assert_close(way, torch.tensor([[1.5, -0.5]]) + torch.tensor([step]) - began - since)
+    assert not way.requires_grad
+
+
+def test_there_is_no_way_without_a_place() -> None:
+    with pytest.raises(ValueError, match="way without place"):
+        VisuomotorController("ant", (8, 8), 16, 8, way=True)
+
+
+@pytest.mark.parametrize("way", [False, True])
 @pytest.mark.parametrize("body", [BALL, ANT])
-def test_the_place_counts_in_the_loss_of_distillation_and_reaches_the_policy(body) -> None:
+def test_the_place_counts_in_the_loss_of_distillation_and_reaches_the_policy(body, way) -> None:
     torch.manual_seed(0)
     m, w = 3, 4
-    controller = VisuomotorController(body.name, (8, 8), 16, 8, place=True)
+    controller = VisuomotorController(body.name, (8, 8), 16, 8, place=True, way=way)
     output = controller(
         torch.randint(0, 255, (m, w, 64, 64, 3), dtype=torch.uint8), torch.randn(m, w, body.proprio_size),
         torch.randint(0, 5, (m, w)), torch.zeros(m, w, dtype=torch.bool), controller.initial_memory(m),
