@@ -1,4 +1,5 @@
 import copy
+import shutil
 
 import numpy as np
 import pytest
@@ -13,15 +14,22 @@ from mujoban_rl.testing import robot_ticks
 from mujoban_rl.weights import WeightsError, save_weights
 
 
-@pytest.fixture
-def exported(tmp_path):
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
     """Weights of a small policy of the ant, which reads heading and place from frames, with their graph."""
     torch.manual_seed(0)
-    policy = VisuomotorController("ant", channels=(8, 8), features=16, hidden=8, place=True)
-    weights = tmp_path / "controller.safetensors"
+    policy = VisuomotorController("ant", channels=(8, 8), features=16, hidden=8, place=True, way=True)
+    weights = tmp_path_factory.mktemp("exported") / "controller.safetensors"
     save_weights(weights, policy, policy.config, {})
     export(weights)
     return weights
+
+
+@pytest.fixture
+def exported(original, tmp_path):
+    """A copy of the weights with their graph, to be changed."""
+    shutil.copytree(original.parent, tmp_path / "copy")
+    return tmp_path / "copy" / original.name
 
 
 def test_the_policy_that_ships_drives_by_its_graph_as_in_pytorch():
