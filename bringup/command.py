@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mujoban_core.bodies import BALL, get_body
+from mujoban_core.bodies import BALL, Body, get_body
 from mujoban_core.look_around import look_around
 from mujoban_core.plugins import (
     AGENT,
@@ -88,8 +88,8 @@ class Stack:
     choices: dict[str, Choice] = field(default_factory=lambda: {role: Choice(role) for role in ROLES})
     device: str = "cpu"
     look_around: int | None = None
-    """Ticks of looking around at the start of an episode; None: the body's `look_ticks`, or 0 for the oracle
-    estimator."""
+    """Ticks of looking around at the start of an episode; None: the body's `look_ticks`, or 0 where no module needs it.
+    """
     deliberation: Deliberation = field(default_factory=Deliberation)
     """How long the planner thinks."""
     threads: int = 1
@@ -105,7 +105,15 @@ class Stack:
         """Ticks of looking around at the start of an episode."""
         if self.look_around is not None:
             return self.look_around
-        return 0 if self.choices["estimator"].source == ORACLE else get_body(self.body).look_ticks
+        body = get_body(self.body)
+        return body.look_ticks if self.choices["estimator"].source != ORACLE or self._seeks_heading(body) else 0
+
+    def _seeks_heading(self, body: Body) -> bool:
+        """Return whether the controller finds its heading by sight."""
+        if body.heading_index is not None:
+            return False
+        controller = self.choices["controller"]
+        return controller.source != ORACLE and not controller.load().privileged
 
     def policy(self) -> SensePlanAct:
         """Return the modules composed into one policy.

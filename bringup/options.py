@@ -118,7 +118,7 @@ class ModuleOptions:
     """Threads of the networks and of batched physics."""
     look_around: Annotated[int | None, whole("TICKS", 0)] = None
     """Look around before the first decision, and walk to where more can be seen: the length of each turn on the spot,
-    0 for none; by default that of docs/estimator.md, 0 for the oracle estimator."""
+    0 for none; by default that of docs/estimator.md."""
     scout: ModuleSource = SCRIPTED
     """What says where to look: scripted, learned, weights of a learned one, or a class of your own."""
 

@@ -3,12 +3,15 @@ import pytest
 
 from bringup.command import Choice, Stack
 from bringup.rollout import ticks
+from mujoban_controller.controller import VisuomotorController
+from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_core.bodies import ANT, BALL, BODIES
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
 from mujoban_core.interfaces import ControllerInput, Planner
 from mujoban_core.look_around import LookAroundPlanner, Scout, look_around
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_core.viewpoints import step_to_view, walk_view
+from mujoban_rl.weights import save_weights
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
@@ -179,6 +182,17 @@ def test_each_body_looks_around_for_as_long_as_it_takes_to_turn():
         body.look_ticks for body in BODIES.values()
     ]
     assert Stack({"estimator": Choice("estimator", "oracle")}).look_around_ticks == 0
+
+
+def test_who_finds_its_heading_by_sight_looks_around_though_its_estimator_is_the_oracle(tmp_path):
+    seeing, told = tmp_path / "controller.safetensors", tmp_path / "teacher.safetensors"
+    for path, network in (
+        (seeing, VisuomotorController("ant", (8, 8), 8, 8)), (told, PrivilegedPolicy("ant", width=8)),
+    ):  # fmt: skip
+        save_weights(path, network, network.config, {})
+    for weights, expected in ((seeing, ANT.look_ticks), (told, 0)):
+        choices = {"estimator": Choice("estimator", "oracle"), "controller": Choice("controller", weights=weights)}
+        assert Stack(choices, body="ant").look_around_ticks == expected
 
 
 def test_a_negative_time_is_refused():
