@@ -59,7 +59,7 @@ class Recurrent(NamedTuple):
     cell: Tensor
     """LSTM cell, [B, H]."""
     track: Tensor
-    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading the needle (4) follows, and with `place` its
+    """Dead reckoning, [B, 7]; see `dead_reckoning`. Without a felt heading the needle (6) follows, and with `place` its
     needles (4)."""
 
 

@@ -9,6 +9,7 @@ Shapes: B robots, W ticks of a window, M windows of a batch, U actuators, F feat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -132,6 +133,7 @@ def imitation_loss(
         loss = loss + config.heading_weight * sight_loss(output.shown.heading, pose[..., 2])
         off = (output.heading * unit(pose[..., 2])).sum(-1).clamp(-1.0, 1.0).acos()
         stats["error/heading_degrees"] = off.rad2deg().median()
+        stats["error/heading_lost"] = (off > math.pi / 4).float().mean()
     if output.shown.place is not None and output.place is not None:
         loss = loss + config.place_weight * place_loss(output.shown.place, pose, cell_size)
         stats["error/place"] = cells_off(output.place, pose, cell_size).median()

@@ -3,8 +3,9 @@
 The ball's steer joint is its heading. A body on a free root has a gyro alone, whose turns sum up to a heading since the
 start of the episode; how that lies in the map only the frames tell. Lines of floor and walls, which are nearly always
 in view, show it up to quarter turns; which of the four it is the skyline shows, the same in all episodes, wherever it
-stands out above the walls (`skyline`). So a needle is kept, of two hands: what a frame shows is added to them, the
-surer the longer, and they turn with the robot in between.
+stands out above the walls (`skyline`). So a hand is kept for the lines, which turns four times as fast as the robot,
+and beside it the odds of the four quarters, which each frame's skyline changes: two frames that leave two quarters each
+may tell together which one it is.
 
 Shapes: B robots, M ticks of any robots, F features of a frame, P proprioceptive values.
 """
@@ -18,22 +19,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.skyline import HEADINGS, Skyline, heading_loss, mean_of, unit
+from mujoban_controller.skyline import HEADINGS, Skyline, heading_loss, unit
 from mujoban_core.bodies import Body
 from mujoban_core.grid import CONTROL_PERIOD, turn_to_instruction
 
-NEEDLE: Final = 4
-"""Components of the needle: of a hand that points in the heading, along the map's x-axis and its y-axis, and of one
-that turns four times as fast, so that quarter turns are alike."""
-SIGHT: Final = HEADINGS + 2
-"""What a frame shows of the heading: logits by the skyline, and the second hand by the lines."""
-_REMEMBERED: Final = 0.99
-"""Share of the first hand that stays from tick to tick: the skyline is out of view for long."""
-_KEPT: Final = 0.9
-"""The same for the second, so that it settles within a second."""
-_SUREST: Final = 0.97
-"""Longest mean vector of what the skyline shows that counts: frames in succession err alike."""
 _QUARTERS: Final = 4
+NEEDLE: Final = _QUARTERS + 2
+"""Components of the needle: log odds of the headings that are a quarter turn each from what the lines show, and the
+hand of the lines, which turns four times as fast as the robot, so that quarter turns are alike."""
+SIGHT: Final = HEADINGS + 2
+"""What a frame shows of the heading: logits by the skyline, and the hand by the lines."""
+_REMEMBERED: Final = 0.995
+"""Share of the odds that stays from tick to tick: the skyline is out of view for long."""
+_KEPT: Final = 0.9
+"""The same for the hand, so that it settles within a second."""
+_QUARTER: Final = math.tau / _QUARTERS
 _SHORTEST: Final = 1e-3
 
 
@@ -66,17 +66,18 @@ class Compass(nn.Module):
             needle: Before the tick; zeros at an episode's start.
         """
         turned = CONTROL_PERIOD * self._part.turn_rate(proprio)
-        first, second = needle.split(2, -1)
-        skyline = mean_of(shown[..., :HEADINGS])
-        first = _REMEMBERED * _turn(first, turned) + _concentration(skyline) * skyline
-        second = _KEPT * _turn(second, _QUARTERS * turned) + shown[..., HEADINGS:]
+        odds, hand = needle.split((_QUARTERS, 2), -1)
+        after = _KEPT * _turn(hand, _QUARTERS * turned) + shown[..., HEADINGS:]
+        fine = _fine(after).detach()
         # The gyro's sum strays by ten degrees within 200 ticks; the lines hold it.
-        return torch.cat([first.norm(dim=-1, keepdim=True) * _nearest(first, second), second], -1)
+        passed = torch.round((_fine(hand) + turned - fine) / _QUARTER)
+        odds = _REMEMBERED * _roll(odds, passed.long()) + _evidence(shown[..., :HEADINGS].detach(), fine)
+        return torch.cat([odds, after], -1)
 
 
 def sight_loss(shown: Tensor, heading: Tensor) -> Tensor:
     """Return how far what frames show, [..., `SIGHT`], is off headings in radians, [...]."""
-    # Squares make the second hand the mean of what may be: short where a frame shows little.
+    # Squares make the hand the mean of what may be: short where a frame shows little.
     lines = functional.mse_loss(shown[..., HEADINGS:], unit(_QUARTERS * heading))
     return lines + heading_loss(shown[..., :HEADINGS], heading)
 
@@ -87,27 +88,28 @@ def _turn(vector: Tensor, angle: Tensor) -> Tensor:
     return torch.stack(turn_to_instruction(x, y, angle.cos(), -angle.sin()), -1)
 
 
-def _concentration(mean: Tensor) -> Tensor:
-    """Return how much mean vectors [..., 2] of headings say, [..., 1]: the concentration over their length.
-
-    That of a von Mises distribution, as Banerjee et al. (2005) approximate it.
-    """
-    squared = mean.square().sum(-1, keepdim=True).clamp(max=_SUREST**2)
-    return (2.0 - squared) / (1.0 - squared)
+def _fine(hand: Tensor) -> Tensor:
+    """Return the heading that hands [..., 2] show, up to quarter turns, [...]; of none it is zero, with a slope."""
+    near = _SHORTEST * (hand.detach().abs().sum(-1) < _SHORTEST)
+    return torch.atan2(hand[..., 1], hand[..., 0] + near) / _QUARTERS
 
 
-def _angle(vector: Tensor) -> Tensor:
-    """Return the angles of vectors [..., 2], [...]; of none it is zero, with a slope."""
-    return torch.atan2(vector[..., 1], vector[..., 0] + _SHORTEST * (vector.detach().abs().sum(-1) < _SHORTEST))
+def _roll(odds: Tensor, passed: Tensor) -> Tensor:
+    """Return odds [B, Q] after robots have passed so many quarters to the left, [B]."""
+    quarters = torch.arange(_QUARTERS, device=odds.device)
+    return odds.gather(-1, (quarters - passed[:, None]) % _QUARTERS)
 
 
-def _nearest(first: Tensor, second: Tensor) -> Tensor:
-    """Return the unit vectors, [..., 2], that the second hand may mean and that are nearest to the first."""
-    fine = _angle(second) / _QUARTERS
-    quarter = math.tau / _QUARTERS
-    return unit(fine + quarter * torch.round((_angle(first.detach()) - fine.detach()) / quarter))
+def _evidence(logits: Tensor, fine: Tensor) -> Tensor:
+    """Return the log odds, [B, Q], of quarters around `fine` and its turns, given what a skyline shows, [B, N]."""
+    middle = torch.round(fine * (HEADINGS / math.tau)).long()
+    every = torch.arange(HEADINGS, device=logits.device) - HEADINGS // (2 * _QUARTERS)
+    around = logits.gather(-1, (middle[:, None] + every) % HEADINGS)
+    shown = around.unflatten(-1, (_QUARTERS, -1)).logsumexp(-1)
+    return shown - shown.mean(-1, keepdim=True)
 
 
 def heading_of(needle: Tensor) -> Tensor:
-    """Return the unit vectors in which needles point, [..., 2]: their first hand, which the lines have set right."""
-    return functional.normalize(needle[..., :2], dim=-1)
+    """Return the unit vectors in which needles point, [..., 2]: what the lines show, in the likeliest quarter."""
+    odds, hand = needle.split((_QUARTERS, 2), -1)
+    return unit(_fine(hand) + _QUARTER * odds.argmax(-1))

@@ -94,9 +94,3 @@ def heading_loss(logits: Tensor, heading: Tensor) -> Tensor:
 def unit(angle: Tensor) -> Tensor:
     """Return unit vectors, [..., 2], of angles in radians, [...]."""
     return torch.stack([angle.cos(), angle.sin()], -1)
-
-
-def mean_of(logits: Tensor) -> Tensor:
-    """Return the mean of the unit vectors that headings may have, [..., 2], given logits, [..., N]."""
-    angle = torch.arange(HEADINGS, device=logits.device) * (math.tau / HEADINGS)
-    return logits.softmax(-1) @ unit(angle).to(logits.dtype)

@@ -12,10 +12,10 @@ import torch
 from mujoban_controller.controller import Recurrent, Sight, VisuomotorController
 from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
 from mujoban_controller.orientation import NEEDLE, SIGHT, Compass, heading_of
-from mujoban_controller.skyline import HEADINGS, Skyline, heading_loss, mean_of, unit
+from mujoban_controller.skyline import HEADINGS, Skyline, heading_loss, unit
 from mujoban_core.bodies import ANT, BALL
 from mujoban_core.camera import project
-from mujoban_core.grid import Instruction
+from mujoban_core.grid import CONTROL_PERIOD, Instruction
 from mujoban_core.interfaces import ControllerInput
 
 
@@ -70,12 +70,25 @@ def test_lines_tell_the_heading_within_the_quarter_that_the_skyline_told_once() 
 def test_a_blind_frame_counts_for_little_beside_one_that_shows_the_skyline() -> None:
     compass = Compass(ANT, 8)
     needle = compass(_sight(90.0, 90.0), _turning(0.0), torch.zeros(1, NEEDLE))
-    vague = _sight(lines=90.0)
-    vague[0, :HEADINGS] = 0.3 * torch.cos(torch.arange(HEADINGS) * math.tau / HEADINGS + math.pi / 2)
-    assert mean_of(vague[0, :HEADINGS])[1] < -0.1  # it rather looks the other way
+    vague = _sight(lines=90.0)  # it rather looks the other way
+    vague[0, :HEADINGS] = 0.2 * torch.cos(torch.arange(HEADINGS) * math.tau / HEADINGS + math.pi / 2)
     for _ in range(20):
         needle = compass(vague, _turning(0.0), needle)
     assert _facing(needle) == pytest.approx(90.0, abs=1.0)
+
+
+@pytest.mark.parametrize("heading", [-140.0, -50.0, 2.0, 44.0, 130.0])
+@torch.no_grad()
+def test_two_frames_that_leave_two_quarters_each_tell_the_heading_together(heading: float) -> None:
+    compass, needle = Compass(ANT, 8), torch.zeros(1, NEEDLE)
+    first = torch.maximum(_sight(heading, heading), _sight(heading + 90.0))
+    # In between it turns to the left by two degrees, by which the quarter may change that its lines lie in.
+    then = torch.maximum(_sight(heading + 2.0, heading + 2.0), _sight(heading + 182.0))
+    first[0, HEADINGS:], then[0, HEADINGS:] = (_sight(lines=x)[0, HEADINGS:] for x in (heading, heading + 2.0))
+    needle = compass(first, _turning(0.0), needle)
+    needle = compass(then, _turning(math.radians(2.0) / CONTROL_PERIOD), needle)
+    off = (_facing(needle) - heading - 2.0 + 180.0) % 360.0 - 180.0
+    assert off == pytest.approx(0.0, abs=0.1)
 
 
 UPRIGHT = torch.tensor([[0.0, 0.0, 1.0]])
@@ -110,7 +123,6 @@ def test_the_loss_of_the_skyline_is_least_where_logits_point_in_the_heading() ->
     logits = [400.0 * torch.cos(headings - heading[:, None] - math.radians(off)) for off in degrees]
     losses = [float(heading_loss(x, heading)) for x in logits]
     assert int(np.argmin(losses)) == 3
-    torch.testing.assert_close(mean_of(logits[3]), unit(heading), atol=0.01, rtol=0.0)
 
 
 def test_an_ant_that_stands_otherwise_does_the_same_for_an_instruction_turned_as_it_is() -> None:
@@ -147,4 +159,5 @@ def test_the_heading_counts_in_the_loss_of_distillation_and_teaches_the_compass(
     assert controller.compass is not None
     for weights in (controller.compass.lines.weight, controller.compass.skyline.panorama):
         assert weights.grad is not None and weights.grad.isfinite().all() and weights.grad.abs().sum() > 0
-    assert 0.0 <= float(statistics["error/heading_degrees"]) <= 180.0
+    # Fresh weights know nothing: the needle stays near the east, and all poses face 2 radians to the left of it.
+    assert 60.0 < float(statistics["error/heading_degrees"]) <= 180.0 and statistics["error/heading_lost"] > 0.5
