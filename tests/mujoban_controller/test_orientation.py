@@ -159,6 +159,6 @@ def test_the_heading_counts_in_the_loss_of_distillation_and_teaches_the_compass(
     assert controller.compass is not None and output.heading is not None
     for weights in (controller.compass.lines.weight, controller.compass.skyline.panorama):
         assert weights.grad is not None and weights.grad.isfinite().all() and weights.grad.abs().sum() > 0
-    off = (output.heading * unit(torch.tensor(2.0))).sum(-1).acos().rad2deg()
+    off = (output.heading.detach() * unit(torch.tensor(2.0))).sum(-1).acos().rad2deg()
     assert float(statistics["error/heading_degrees"]) == pytest.approx(float(off.median()), abs=0.1)
     assert float(statistics["error/heading_lost"]) == pytest.approx(float((off > 45.0).float().mean()))
