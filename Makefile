@@ -9,6 +9,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+INSTALLED := .venv/.packages
 STAMP := .venv/.installed
 INPUTS := pyproject.toml setup.py mujoban_msgs_py/interface_build.py $(wildcard mujoban_msgs_py/msg/*.msg)
 ARGS ?=
@@ -26,10 +27,13 @@ COLCON_WHEELS := colcon-common-extensions cmake ninja ros-jazzy-rclpy[fastrtps]=
 setup: $(STAMP)
 
 # Without --no-compile pip spends over a minute on bytecode of modules that nobody imports.
-$(STAMP): $(INPUTS) bringup/check_machine.py
+$(INSTALLED): $(INPUTS) bringup/check_machine.py
 	@$(PYTHON) bringup/check_machine.py
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --no-compile --editable '.[dev]'
+	@touch $@
+
+$(STAMP): $(INSTALLED)
 	@echo "compiling kernels, so that the first run need not"
 	@$(BIN)/python -m bringup.compile_kernels
 	@touch $@
@@ -40,7 +44,7 @@ run: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
-lint: $(STAMP)
+lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports

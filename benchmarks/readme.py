@@ -124,8 +124,9 @@ def copy_repository(folder: Path, fresh: bool) -> None:
     for part in Path(sys.prefix).iterdir():
         (folder / ".venv" / part.name).symlink_to(part)
     # Newer than what `make` compares it with, so that nothing is installed into the environment that is lent.
-    (folder / ".venv" / ".installed").unlink(missing_ok=True)
-    (folder / ".venv" / ".installed").touch()
+    for stamp in (".packages", ".installed"):  # in the order in which `make` has them
+        (folder / ".venv" / stamp).unlink(missing_ok=True)
+        (folder / ".venv" / stamp).touch()
 
 
 class Terminal(Run):
