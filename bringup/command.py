@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,6 +49,13 @@ class Choice:
         if text.endswith(".safetensors"):
             return cls(role, LEARNED, Path(text))
         return cls(role, text)
+
+    def of(self, body: str) -> Choice:
+        """Return the same with the weights that ship for a body, where it takes those that ship."""
+        if self.source != LEARNED or self.weights is not None:
+            return self
+        own = shipped_weights(self.role, body)
+        return self if own == shipped_weights(self.role) else replace(self, weights=own)
 
     def load(self, device: str = "cpu") -> Module:
         """Return the module.
@@ -96,9 +103,13 @@ class Stack:
     """Threads of the networks in each process."""
 
     body: str = BALL.name
-    """The robot's body; learned modules have to be of it."""
+    """The robot's body; learned modules have to be of it, and those that ship for it are taken."""
     scout: Choice = Choice(SCOUT, SCRIPTED)
     """What says where to look before pushing."""
+
+    def __post_init__(self) -> None:
+        """Choose the weights that ship for the body."""
+        object.__setattr__(self, "choices", {role: choice.of(self.body) for role, choice in self.choices.items()})
 
     @property
     def look_around_ticks(self) -> int:

@@ -117,11 +117,17 @@ def is_privileged(identity: str) -> bool:
     return identity == ORACLE or identity.endswith(PRIVILEGED)
 
 
-def shipped_weights(role: str) -> Path:
-    """Return where the weights of the learned module for a role are."""
+def shipped_weights(role: str, body: str | None = None) -> Path:
+    """Return where the weights of the learned module for a role are.
+
+    Those of a body lie beside: `controller_ant.safetensors` for the body "ant". Where there are none, those of the
+    default body are meant, which may fit (a planner's do) or not (`check_body`).
+    """
     if role != SCOUT:
         _interface(role)
-    return Path(str(_load(role, _SHIPPED)))
+    path = Path(str(_load(role, _SHIPPED)))
+    own = path.with_stem(f"{role}_{body}")
+    return own if own.is_file() else path
 
 
 def _interface(role: str) -> type[Module]:

@@ -1,10 +1,12 @@
-"""Modules of a user's own that cannot be used are named with what was expected of them."""
+"""Which module plays; those of a user's own that cannot are named with what was expected of them."""
 
 import re
 
 import pytest
 
-from mujoban_core.plugins import PluginError, load_module
+import mujoban_controller
+from bringup.command import Choice, Stack
+from mujoban_core.plugins import ORACLE, PluginError, load_module, shipped_weights
 
 
 @pytest.mark.parametrize(
@@ -24,3 +26,16 @@ def test_a_module_of_which_an_import_fails_is_named(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(PluginError, match=r"their_planner:Mine.*cannot import name 'Plannner'"):
         load_module("planner", "their_planner:Mine")
+
+
+def test_a_body_plays_with_the_weights_that_ship_for_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(mujoban_controller, "SHIPPED", tmp_path / "controller_ball.safetensors")
+    for body in ("ball", "ant"):
+        (tmp_path / f"controller_{body}.safetensors").touch()
+    assert shipped_weights("controller", "ant") == tmp_path / "controller_ant.safetensors"
+    assert shipped_weights("controller", "cart") == shipped_weights("controller") == mujoban_controller.SHIPPED
+    played = Stack(body="ant").choices
+    assert played["controller"].weights == tmp_path / "controller_ant.safetensors"
+    assert played["planner"].weights is None
+    for own in (Choice("controller", weights=tmp_path / "mine.safetensors"), Choice("controller", ORACLE)):
+        assert Stack({"controller": own}, body="ant").choices == {"controller": own}
