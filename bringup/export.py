@@ -17,13 +17,11 @@ from typing import Annotated, Final
 
 import tyro
 
-from mujoban_controller import SHIPPED as CONTROLLER
 from mujoban_controller.export import export as export_controller
+from mujoban_core.bodies import BODIES
+from mujoban_core.plugins import ROLES, shipped_weights
 from mujoban_core.program import read_options, run_command
-from mujoban_estimator import SHIPPED as ESTIMATOR
-from mujoban_estimator import SHIPPED_TERMINATION as TERMINATION
 from mujoban_estimator.export import export_estimator, export_termination
-from mujoban_planner import SHIPPED as PLANNER
 from mujoban_planner.export import export as export_planner
 from mujoban_planner.networks import ARCHITECTURES
 from mujoban_rl.compiled import PROGRAM as PROG
@@ -38,11 +36,14 @@ EXPORTERS: Final[Mapping[str, Callable[[Path], Path]]] = {
 """By the class in a record."""
 
 
+SHIPPED: Final = tuple(dict.fromkeys(shipped_weights(role, body) for role in ROLES for body in BODIES))
+
+
 @dataclass(frozen=True)
 class Options:
     """Which modules to export."""
 
-    weights: Annotated[tuple[Path, ...], tyro.conf.Positional] = (ESTIMATOR, TERMINATION, PLANNER, CONTROLLER)
+    weights: Annotated[tuple[Path, ...], tyro.conf.Positional] = SHIPPED
     """`.safetensors` files with their records beside; all that ship by default."""
 
 

@@ -102,7 +102,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "Turns an instruction into motor torques (paper C.3).",
         "The camera frame, proprioception, the instruction and the termination signal. No pose, no ground truth.",
         "One body and the physics that it was trained in. A box that rests against pegs off its lane is lost to it.",
-        "turns on the spot while the robot looks around; angles and dead reckoning feed it",
+        "turns on the spot while the robot looks around, where one action does it; angles and dead reckoning feed it, "
+        "and filters of what it reads from frames: of the heading, where none is felt, and of the place in a cell",
         {
             "scripted driver": "supervised, by a scripted driver that knows the truth, on its own play",
             "distil": "supervised, by a teacher that knows the truth, on its own play",
