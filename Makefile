@@ -26,11 +26,10 @@ COLCON_WHEELS := colcon-common-extensions cmake ninja ros-jazzy-rclpy[fastrtps]=
 
 setup: $(STAMP)
 
-# Without --no-compile pip spends over a minute on bytecode of modules that nobody imports.
 $(INSTALLED): $(INPUTS) bringup/check_machine.py
 	@$(PYTHON) bringup/check_machine.py
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --no-compile --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@
 
 $(STAMP): $(INSTALLED)
