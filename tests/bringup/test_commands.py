@@ -19,6 +19,7 @@ from bringup import evaluate, record, run_stack, train
 from bringup.command import Stack, recorded_seed
 from bringup.options import EpisodeOptions
 from bringup.reporting import Reporting, played
+from mujoban_controller import teacher_weights
 from mujoban_core.bodies import ANT
 from mujoban_core.files import digest
 from mujoban_core.program import exit_status
@@ -382,10 +383,12 @@ def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capf
     content = json.loads(report.read_text())
     assert content["body"] == "ant"
     assert f"controller: weights {content['weights']['controller'][:12]}\n" in capfd.readouterr().out
-    assert run(evaluate, *few, *oracles) == 2
+    assert run(evaluate, *few, *oracles) == 0, "by default it plays with the weights that ship for it"
+    unfit = ["--controller", teacher_weights("ball")]
+    assert run(evaluate, *few, *oracles, *unfit) == 2
     error = capfd.readouterr().err
     assert "the controller was trained for the body ball: expected weights for ant" in error
-    assert run(run_stack, "--headless", *few, *oracles) == 2
+    assert run(run_stack, "--headless", *few, *oracles, *unfit) == 2
     error = capfd.readouterr().err.splitlines()[-1]
     assert error.endswith("the controller was trained for the body ball: expected weights for ant, or an oracle")
     looking = [*few, *oracles, "--controller", ant_teacher, "--look-around", 5, "--json", report]

@@ -61,7 +61,8 @@ def test_weights_of_another_body_are_refused_by_a_node_when_it_starts_and_while_
     refused = graph.call(SetParameters, "/controller/set_parameters", request).results[0]
     why = "the controller was trained for the body ball: expected weights for ant, or an oracle"
     assert not refused.successful and refused.reason == why
-    write_parameters(graph_parameters(Stack(body="ant"), Episodes(1, 0)), tmp_path / "ant.yaml")
+    unfit = Stack(oracles.choices | {"controller": Choice("controller", weights=teacher_weights("ball"))}, body="ant")
+    write_parameters(graph_parameters(unfit, Episodes(1, 0)), tmp_path / "ant.yaml")
     command = [sys.executable, "-m", "mujoban_controller.node", "--ros-args", "--params-file", tmp_path / "ant.yaml"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (2, f"error: {why}\n")
