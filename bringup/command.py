@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -111,7 +112,7 @@ class Stack:
         """Choose the weights that ship for the body."""
         object.__setattr__(self, "choices", {role: choice.of(self.body) for role, choice in self.choices.items()})
 
-    @property
+    @cached_property
     def look_around_ticks(self) -> int:
         """Ticks of looking around at the start of an episode."""
         if self.look_around is not None:

@@ -29,7 +29,7 @@ from torch.nn import functional
 
 from mujoban_controller.drivers import ControllerDriver, Driver
 from mujoban_controller.orientation import NEEDLE, Compass, heading_of
-from mujoban_controller.place import PLACE, WAY, Place, phases_along, way_left
+from mujoban_controller.place import PLACE, Place, phases_along, way_left
 from mujoban_controller.policy import GoalPolicy
 from mujoban_controller.skyline import unit
 from mujoban_core.bodies import get_body
@@ -47,6 +47,8 @@ MEMORY_FIELDS = ("memory0", "memory1", "memory2")
 _CLIP = 5.0
 _NEAR = 4.0
 """How much closer the way is looked at at its end."""
+_WAY = 4
+"""Inputs that tell the way left: as it is, and from close by."""
 _TRACK = 7
 _NEEDLE = _TRACK + NEEDLE
 
@@ -192,7 +194,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         # Where the heading is felt, joint positions are replaced by two sine-cosine pairs; else where the instruction
         # leads is told, as the robot sees it. A is one-hot, beta one bit.
         angles = 3 * self.joints if self.compass is None else 2
-        inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1 + PLACE * place + WAY * way
+        inputs = self.proprio_size + angles + len(Instruction) + 1 + _TRACK - 1 + PLACE * place + _WAY * way
         shrink = 2 ** (len(channels) - 1)
         # Who does not feel the heading has to look at the skyline.
         self.first_row = rows_of_sky(layout.camera, shrink) if self.compass is None else 0

@@ -356,8 +356,8 @@ class GoalTask:
                 )
         issued = np.zeros(world.batch, np.bool_)
         issued[rows] = True
-        looked = world.steps - self._noise.elapsed < self.config.look
         if world.body.turn is None:
+            looked = world.steps - self._noise.elapsed < self.config.look
             goes_on = self._rng.random(world.batch) < self.config.instructions.stays_on
             goes_on &= ~self.first & (previous == Instruction.STAY) & ~looked
             self.instruction[issued & goes_on] = Instruction.STAY

@@ -22,8 +22,6 @@ from mujoban_core.grid import turn_to_instruction
 
 PLACE: Final = 4
 """Components of the needles: cosines of the phases along two axes, then their sines; zero in the middle of a cell."""
-WAY: Final = 4
-"""Components of `way_left`."""
 _KEPT: Final = 0.95
 """Share of the needles that stays from tick to tick."""
 
