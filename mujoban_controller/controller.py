@@ -6,11 +6,11 @@ the mean and scale of a normal distribution over torques.
 Proprioception holds joint positions, so the network is given sine and cosine of each hinge, as they are and
 turned into the frame of the instruction (instructed direction = +x). For the ball, whose steer joint is the
 heading, this says at once by how much to turn. A body that does not feel its heading is told it by its gyro and the
-frames (`orientation`).
+frames (`mujoban_rl.sight`).
 
 It is also given dead reckoning: how far the robot has come since the instruction began, which is the sum of the
 velocities that it feels. The sum is part of the memory, beside the LSTM's; A, o_pr and beta are all it takes. Where the
-robot is within its cell stands in the memory too (`place`).
+robot is within its cell stands in the memory too (`mujoban_rl.sight.place`).
 
 Shape legend: B robots, T ticks, P proprioceptive values, J joints, U actuators, F features, H memory units, D values
 of a track.
@@ -28,16 +28,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_controller.drivers import ControllerDriver, Driver
-from mujoban_controller.orientation import NEEDLE, Compass, heading_of
-from mujoban_controller.place import PLACE, Place, phases_along, way_left
 from mujoban_controller.policy import GoalPolicy
-from mujoban_controller.skyline import unit
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, OFFSETS_XY, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
 from mujoban_rl.compiled import Compilable
 from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder, gaussian, gaussian_layers, rows_of_sky
+from mujoban_rl.sight.orientation import NEEDLE, Compass, heading_of
+from mujoban_rl.sight.place import PLACE, Place, phases_along, way_left
+from mujoban_rl.sight.skyline import unit
 from mujoban_rl.ticks import TICK, tick_arrays
 
 INPUT_FIELDS = TICK

@@ -23,17 +23,17 @@ from mujoban_controller.controller import INPUT_FIELDS, ControllerOutput, Visuom
 from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import GOAL_SIZE, goal_offsets
 from mujoban_controller.goal_task import GoalTask
-from mujoban_controller.orientation import sight_loss
-from mujoban_controller.place import cells_off, place_loss
 from mujoban_controller.play import Batch, CameraPlayer, Fields, put_on
 from mujoban_controller.product import ProductLearner, Validation
-from mujoban_controller.skyline import unit
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_rl.engine import Scalars, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
+from mujoban_rl.sight.orientation import sight_loss
+from mujoban_rl.sight.place import cells_off, place_loss
+from mujoban_rl.sight.skyline import unit
 from mujoban_sim.goals import GoalKind
 
 _KINDS = len(GoalKind) - 1

@@ -52,7 +52,7 @@ def load_termination(
     Raises:
         mujoban_rl.weights.WeightsError: If the weights are missing, damaged or do not fit, or their graph is damaged.
     """
-    from mujoban_estimator.compiled import STEP, step_examples
+    from mujoban_estimator.compiled import step_examples, step_signature
     from mujoban_estimator.termination import ControlTermination
     from mujoban_rl.compiled import load_graph
     from mujoban_rl.weights import load_weights, read_record
@@ -60,5 +60,6 @@ def load_termination(
     file = Path(path or SHIPPED_TERMINATION)
     termination = load_weights(ControlTermination, file, device)
     if compiled and termination.device.type == "cpu":
-        termination.compiled = load_graph(file, read_record(file), STEP, termination.tick, step_examples(termination))
+        signature, examples = step_signature(termination), step_examples(termination)
+        termination.compiled = load_graph(file, read_record(file), signature, termination.tick, examples)
     return termination

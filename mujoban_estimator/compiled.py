@@ -13,19 +13,9 @@ from mujoban_core.camera import FRAME_SIZE
 from mujoban_estimator.estimator import StateEstimator
 from mujoban_estimator.geometry import cell_geometry
 from mujoban_estimator.odometry import Track
-from mujoban_estimator.termination import ControlTermination
+from mujoban_estimator.termination import ControlTermination, parts_of
 from mujoban_rl.compiled import Signature
 from mujoban_rl.ticks import TICK, tick_examples
-
-_MEMORY: Final = ("hidden", "cell", *Track._fields)
-
-STEP: Final = Signature(
-    inputs=(*TICK, *_MEMORY),
-    outputs=("probability", *(f"{name}_after" for name in _MEMORY)),
-    tolerance=0.01,
-)
-"""`ControlTermination.tick`."""
-
 
 UPDATE: Final = Signature(
     inputs=("frame", "relative", "pixels", "visible", "hidden", "cell"),
@@ -34,6 +24,12 @@ UPDATE: Final = Signature(
 )
 """`StateEstimator.update`."""
 _EXAMPLES: Final = 3
+
+
+def step_signature(termination: ControlTermination) -> Signature:
+    """Return the signature of `ControlTermination.tick`; a body that does not feel its heading has needles."""
+    memory = ["hidden", "cell", *Track._fields, *(["needles"] if termination.bearings is not None else [])]
+    return Signature((*TICK, *memory), ("probability", *(f"{name}_after" for name in memory)), tolerance=0.01)
 
 
 def update_examples(estimator: StateEstimator) -> Iterator[list[NDArray[Any]]]:
@@ -51,7 +47,6 @@ def update_examples(estimator: StateEstimator) -> Iterator[list[NDArray[Any]]]:
 
 def step_examples(termination: ControlTermination) -> Iterator[list[NDArray[Any]]]:
     """Yield a fixed input of a tick for each instruction."""
-    hidden, cell, track = termination.initial_memory(1)
-    memory = [part.cpu().numpy() for part in (hidden, cell, *track)]
+    memory = [part.cpu().numpy() for part in parts_of(termination.initial_memory(1))]
     for seen in tick_examples(get_body(termination.config.body).proprio_size):
         yield [*seen, *memory]

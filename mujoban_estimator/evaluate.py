@@ -13,6 +13,7 @@ if __name__ == "__main__":
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,6 +31,7 @@ from mujoban_estimator.data import Batch, Batcher, Stretch, choose_windows
 from mujoban_estimator.encoder import FrameEncoder
 from mujoban_estimator.estimator import Belief, StateEstimator, probabilities
 from mujoban_estimator.metrics import MapScores, TerminationScores
+from mujoban_estimator.odometry import Track
 from mujoban_estimator.termination import ControlTermination
 from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
 
@@ -77,6 +79,13 @@ def _chain(bags: Sequence[Path], report: ReadReport, skip_damaged: bool) -> Iter
         yield from stretches(bag, _LENGTH, report, allow_test_seeds=True)
 
 
+class _Place(NamedTuple):
+    """What control termination remembers of its way from batch to batch."""
+
+    track: Track
+    needles: tuple[Tensor, ...]
+
+
 class _Scoring:
     """Runs both modules over batches and counts."""
 
@@ -84,7 +93,7 @@ class _Scoring:
         self.maps, self.ends = MapScores(), TerminationScores()
         self._estimator, self._termination = estimator, termination
         self._belief = estimator.initial_belief(streams)
-        self._track = termination.odometry.initial(streams, termination.device)
+        self._place = _start_of(termination, streams)
         self._rng = np.random.default_rng(0)
 
     @torch.inference_mode()
@@ -92,8 +101,7 @@ class _Scoring:
         """Count a batch, which continues the one before."""
         streams = len(batch.valid)
         self._belief = renew_rows(self._belief, self._estimator.initial_belief(streams), batch.first)
-        fresh = self._termination.odometry.initial(streams, self._termination.device)
-        self._track = renew_rows(self._track, fresh, batch.first)
+        self._place = renew_rows(self._place, _start_of(self._termination, streams), batch.first)
         self._add_maps(batch)
         self._add_ends(batch)
 
@@ -113,20 +121,38 @@ class _Scoring:
     def _add_ends(self, batch: Batch) -> None:
         module = self._termination
         device = module.device
-        instruction, proprio, terminated = (
-            torch.from_numpy(x).to(device) for x in (batch.instruction, batch.proprio, batch.terminated)
+        proprio, instruction, terminated = (
+            torch.from_numpy(x).to(device) for x in (batch.proprio, batch.instruction, batch.terminated)
         )
-        progress, self._track = module.odometry(proprio, instruction, terminated, self._track)
+        seen, shown = self._look(batch.frame, proprio)
+        progress = module.progress(shown, proprio, instruction, terminated, *self._place)
+        self._place = _Place(progress.track, progress.needles)
         windows = choose_windows(batch, batch.valid.size, INSTRUCTION_LIMIT + 1, self._rng)
         for start in range(0, len(windows.stream), _STREAMS):
             part = slice(start, start + _STREAMS)
             at = (windows.stream[part, None], windows.tick[part])
-            features = _encode(module.encoder, batch.frame[at], device)
-            recurrence = module.initial_recurrence(len(features))
-            output = module(features, progress[at], proprio[at], *recurrence)
+            recurrence = module.initial_recurrence(len(windows.stream[part]))
+            output = module(seen[at], progress.features[at], proprio[at], *recurrence)
             probability = torch.sigmoid(output.logits).cpu().numpy()
             for p, completed, valid in zip(probability, batch.completed[at], windows.valid[part], strict=True):
                 self.ends.add(p[valid], completed[valid], module.threshold)
+
+    def _look(self, frames: NDArray[np.uint8], proprio: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return what control termination sees in frames [B, T, ...], and what they show it, both [B, T, ...]."""
+        module, size = self._termination, frames.shape[:2]
+        looked, shown = [], []
+        chunks, parts = (x.flatten(0, 1).split(_CHUNK) for x in (torch.from_numpy(frames), proprio))
+        for chunk, felt in zip(chunks, parts, strict=True):
+            image = chunk.to(module.device)
+            looked.append(module.look(module.encoder(image)))
+            shown.append(module.read(image, looked[-1], felt))
+        told = None if module.bearings is None else torch.cat(shown).unflatten(0, size)
+        return torch.cat(looked).unflatten(0, size), told
+
+
+def _start_of(termination: ControlTermination, streams: int) -> _Place:
+    track = termination.odometry.initial(streams, termination.device)
+    return _Place(track, termination.initial_needles(streams))
 
 
 def _encode(encoder: FrameEncoder, frames: NDArray[np.uint8], device: torch.device) -> Tensor:

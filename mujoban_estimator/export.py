@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from mujoban_estimator import load, load_termination
-from mujoban_estimator.compiled import STEP, UPDATE, step_examples, update_examples
+from mujoban_estimator.compiled import UPDATE, step_examples, step_signature, update_examples
 from mujoban_rl.export import export_graph
 
 
@@ -22,4 +22,4 @@ def export_termination(weights: Path) -> Path:
     """Write the graph of a control termination's weights beside them, and return where; see `export_graph`."""
     termination = load_termination(weights, compiled=False)
     inputs = [torch.from_numpy(x) for x in next(step_examples(termination))]
-    return export_graph(weights, termination, termination.tick, inputs, STEP)
+    return export_graph(weights, termination, termination.tick, inputs, step_signature(termination))

@@ -5,12 +5,13 @@ Shapes: S streams, T ticks of a stretch, K = T / `update_every` frames that the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -33,6 +34,11 @@ from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import WeightsError, load_weights, save_weights
 
+_PLACE_OFF: Final = 0.02
+"""Standard deviation of what needles of the place are off in use, in cells."""
+_HEADING_OFF: Final = math.radians(2.0)
+"""The same of those of the heading."""
+
 
 @dataclass(frozen=True)
 class LearnerConfig:
@@ -50,6 +56,8 @@ class LearnerConfig:
     """Weight of the auxiliary loss on single frames."""
     place: float = 0.5
     """Weight of the auxiliary loss on the place within the cell."""
+    bearings: float = 0.5
+    """Weight of that on what frames show of heading and place, for a body that does not feel its heading."""
     cells: float = 0.1
     """Weight of the estimator's loss, a sum over cells, beside termination's."""
     slip: float = 0.05
@@ -64,7 +72,7 @@ class LearnerConfig:
         if differing:
             raise ValueError(f"estimator and termination differ in {', '.join(differing)}: expected one shared ResNet")
         check_counts(self, "window_frames", "window_length")
-        check_not_negative(self, "unseen", "frame", "place", "cells", "slip")
+        check_not_negative(self, "unseen", "frame", "place", "bearings", "cells", "slip")
         check_shares(self, "lost")
 
 
@@ -118,6 +126,8 @@ class _Shard(NamedTuple):
     windows: Windows
     belief: Belief
     track: Track
+    off: NDArray[np.float32]
+    """By how much needles are off when an instruction begins, in standard deviations, [W, 3]."""
 
 
 class _Learned(NamedTuple):
@@ -174,6 +184,8 @@ class EstimatorLearner(Learner[Batch]):
     def start_from(self, folder: Path) -> None:
         """Begin with the weights of former modules; the ResNet is the estimator's.
 
+        Modules of another body lend what does not depend on the body: all layers of the same name and shape.
+
         Raises:
             WeightsError: If a file is missing or damaged, or of another configuration.
         """
@@ -181,9 +193,11 @@ class EstimatorLearner(Learner[Batch]):
             path = folder / f"{name}.safetensors"
             trained = load_weights(type(module), path)
             theirs, ours = (_learned_for(m.hyperparameters()) for m in (trained, module))
-            if theirs != ours:
+            if theirs | {"body": ours["body"]} != ours:
                 raise WeightsError(f"{path}: weights of {theirs}, expected those of {ours}")
-            module.load_state_dict(trained.state_dict())
+            own, same_body = module.state_dict(), theirs == ours
+            fitting = {k: v for k, v in trained.state_dict().items() if k in own and v.shape == own[k].shape}
+            module.load_state_dict(trained.state_dict() if same_body else fitting, strict=same_body)
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> dict[str, float]:
         """Take one gradient step; return the parts of the loss."""
@@ -248,7 +262,9 @@ class EstimatorLearner(Learner[Batch]):
         for rows in (slice(*both) for both in pairwise(bounds)):
             part = Batch._make(values[rows] for values in batch)
             windows = choose_windows(part, frames, self.config.window_length, self.rng)
-            yield _Shard(part, windows, Belief(*(b[rows] for b in belief)), Track(*(t[rows] for t in track)))
+            count = 0 if self.termination.bearings is None else len(windows.stream)
+            off = self.rng.normal(size=(count, 3)).astype(np.float32)
+            yield _Shard(part, windows, Belief(*(b[rows] for b in belief)), Track(*(t[rows] for t in track)), off)
 
     def _gradients(self, shard: _Shard) -> _Learned:
         learned = self._loss(shard)
@@ -264,12 +280,17 @@ class EstimatorLearner(Learner[Batch]):
         felt = (windows.stream[:, None] * ticks + windows.tick).ravel()
         # Frames that both look at are encoded once.
         frames, place = np.unique(np.concatenate([seen, felt]), return_inverse=True)
+        images = self._tensor(batch.frame.reshape(-1, *batch.frame.shape[2:])[frames])
         with autocast(self.device):
-            encoded = self.estimator.encoder(self._tensor(batch.frame.reshape(-1, *batch.frame.shape[2:])[frames]))
-            features = encoded[torch.from_numpy(place).to(self.device)]
-            mapped, parts, belief = self._estimator_loss(features[: len(seen)], shard, updates)
-            ended, more, track = self._termination_loss(features[len(seen) :], shard)
-        return _Learned(self.config.cells * mapped + ended, {**parts, **more}, (), belief, track)
+            encoded = self.estimator.encoder(images)
+            features = encoded[torch.from_numpy(place[: len(seen)]).to(self.device)]
+            mapped, parts, belief = self._estimator_loss(features, shard, updates)
+            looked = self.termination.look(encoded)
+            shown, told = self._bearings_loss(images, looked, batch, frames)
+            at = torch.from_numpy(place[len(seen) :].reshape(windows.tick.shape)).to(self.device)
+            ended, more, track = self._termination_loss(looked[at], None if shown is None else shown[at], shard)
+        loss = self.config.cells * mapped + ended + self.config.bearings * told
+        return _Learned(loss, {**parts, **more, "bearings": told.detach()}, (), belief, track)
 
     def _estimator_loss(
         self, features: Tensor, shard: _Shard, updates: NDArray[np.int64]
@@ -286,21 +307,52 @@ class EstimatorLearner(Learner[Batch]):
         )  # fmt: skip
         return loss, parts, belief
 
-    def _termination_loss(self, features: Tensor, shard: _Shard) -> tuple[Tensor, dict[str, Tensor], Track]:
+    def _bearings_loss(
+        self, images: Tensor, looked: Tensor, batch: Batch, frames: NDArray[np.int64]
+    ) -> tuple[Tensor | None, Tensor]:
+        """Return what frames with these numbers in a batch show of heading and place, and how far it is off."""
+        if self.termination.bearings is None:
+            return None, images.new_zeros((), dtype=torch.float32)
+        proprio, pose = (self._tensor(x.reshape(-1, x.shape[-1])[frames]) for x in (batch.proprio, batch.pose))
+        shown = self.termination.read(images, looked, proprio)
+        assert shown is not None
+        return shown, self.termination.bearings.loss(shown, pose)
+
+    def _termination_loss(
+        self, looked: Tensor, shown: Tensor | None, shard: _Shard
+    ) -> tuple[Tensor, dict[str, Tensor], Track]:
         batch, windows = shard.batch, shard.windows
-        instruction, proprio = self._tensor(batch.instruction), self._tensor(batch.proprio)
-        terminated = self._tensor(batch.terminated)
-        progress, track = self.termination.odometry(proprio, instruction, terminated, shard.track)
         at = (windows.stream[:, None], windows.tick)
-        hidden, cell = self.termination.initial_recurrence(len(windows.stream))
-        output = self.termination(features.unflatten(0, windows.tick.shape), progress[at], proprio[at], hidden, cell)
+        first = (windows.stream, windows.tick[:, 0])
+        proprio, instruction = self._tensor(batch.proprio), self._tensor(batch.instruction)
+        terminated = self._tensor(batch.terminated)
+        heading = None if shown is None else self._tensor(batch.pose[..., 2])
+        tracks = self.termination.odometry.follow(proprio, instruction, terminated, shard.track, heading)
+        both = zip(shard.track, tracks, strict=True)
+        before = Track(*(torch.cat([start[:, None], after[:, :-1]], 1)[first] for start, after in both))
+        needles = self._needles(shard)
+        progress = self.termination.progress(shown, proprio[at], instruction[at], terminated[at], before, needles)
+        recurrence = self.termination.initial_recurrence(len(windows.stream))
+        output = self.termination(looked, progress.features, proprio[at], *recurrence)
         direction = self._tensor(OFFSETS_XY[batch.instruction[at]].astype(np.float32))
         phases = true_phases(self._tensor(batch.pose[at]), direction, self.termination.odometry.cell_size)
         loss, parts = termination_loss(
             output.logits, output.phases, self._tensor(batch.completed[at]), phases,
             self._tensor(windows.valid).float(), place=self.config.place,
         )  # fmt: skip
-        return loss, parts, track
+        return loss, parts, tracks.after()
+
+    def _needles(self, shard: _Shard) -> tuple[Tensor, ...]:
+        """Return needles as they may stand when an instruction begins: nearly right, or at an episode's start zero."""
+        bearings, (batch, windows) = self.termination.bearings, shard[:2]
+        if bearings is None:
+            return ()
+        first = windows.tick[:, 0]
+        cell = self.termination.odometry.cell_size
+        off = shard.off * np.array([_PLACE_OFF * cell, _PLACE_OFF * cell, _HEADING_OFF], np.float32)
+        needles = bearings.pointing(self._tensor(batch.pose[windows.stream, first] + off))
+        begins = self._tensor(batch.first[windows.stream] & (first == 0))
+        return (torch.where(begins[:, None], torch.zeros_like(needles), needles),)
 
     def _tensor(self, values: NDArray) -> Tensor:
         return torch.from_numpy(values).to(self.device)

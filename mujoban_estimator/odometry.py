@@ -3,8 +3,8 @@
 Termination has to say whether the robot is within a tenth of a cell of a cell's centre, without being told its pose.
 Velocity and heading are felt, so how far the robot has come since its episode began at a cell's centre can be summed
 up; the camera corrects the drift. Everything is turned so that the instruction points along +x, since
-what completes an instruction does not depend on the compass. A body that does not feel its heading sums up its turns
-as well; its axes are then those in which its episode began, and how they lie in the map is for the camera to tell.
+what completes an instruction does not depend on the compass. A body that does not feel its heading is told it by its
+frames (`bearings`).
 
 Shapes: B robots, T ticks, P proprioceptive values.
 """
@@ -45,7 +45,11 @@ class Track(NamedTuple):
     before: Tensor
     """That of the instruction before it, [B, 2]."""
     heading: Tensor
-    """Felt, or turned since the start of the episode, [B] radians."""
+    """Felt, or seen, [B] radians."""
+
+    def after(self) -> Track:
+        """Return the last of the tracks of ticks, [B, ...] of [B, T, ...]."""
+        return Track(*(part[:, -1] for part in self))
 
 
 class Odometry:
@@ -65,7 +69,7 @@ class Odometry:
     def __call__(
         self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Track
     ) -> tuple[Tensor, Track]:
-        """Return features [B, T, FEATURES] and the track after the last tick.
+        """Return features [B, T, FEATURES] and the track after the last tick, of a body that feels its heading.
 
         Args:
             proprio: o_pr, [B, T, P].
@@ -73,22 +77,36 @@ class Odometry:
             terminated: beta_{t-1}, bool [B, T]; A_{t-1} was issued in the tick before where true.
             track: before the first tick.
         """
-        psi = self._headings(proprio, track)
+        tracks = self.follow(proprio, instruction, terminated, track)
+        return self.features(proprio, tracks), tracks.after()
+
+    def follow(
+        self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Track, heading: Tensor | None = None
+    ) -> Track:
+        """Return the tracks after each tick, [B, T, ...]; arguments as above.
+
+        Args:
+            proprio: o_pr.
+            instruction: A_{t-1}.
+            terminated: beta_{t-1}.
+            track: before the first tick.
+            heading: in the map frame, radians [B, T]; needed of a body that does not feel it.
+        """
+        psi = proprio[..., self.heading] if heading is None else heading
         cos, sin = psi.cos(), psi.sin()
         ahead, left = (proprio[..., self.part.planar_velocity] / self.cell_size).unbind(-1)
         velocity = torch.stack([ahead * cos - left * sin, ahead * sin + left * cos], dim=-1)  # [B, T, 2]
         offsets = torch.as_tensor(OFFSETS_XY, dtype=proprio.dtype, device=proprio.device)
-        direction = offsets[instruction]
-        tracks = _follow(track, velocity, direction, terminated, psi)
-        return self._features(proprio, velocity, direction, tracks), Track(*(part[:, -1] for part in tracks))
+        return _follow(track, velocity, offsets[instruction], terminated, psi)
 
-    def _headings(self, proprio: Tensor, track: Track) -> Tensor:
-        """Return the heading of each tick, [B, T]."""
-        if self.heading is not None:
-            return proprio[..., self.heading]
-        return track.heading[:, None] + (CONTROL_PERIOD * self.part.turn_rate(proprio)).cumsum(1)
+    def features(self, proprio: Tensor, track: Track) -> Tensor:
+        """Return the features of ticks, [B, T, FEATURES].
 
-    def _features(self, proprio: Tensor, velocity: Tensor, direction: Tensor, track: Track) -> Tensor:
+        Args:
+            proprio: o_pr, [B, T, P].
+            track: after each tick, [B, T, ...].
+        """
+        direction = track.direction
         stay = (direction == 0).all(dim=-1, keepdim=True)
         psi = track.heading[..., None]
         heading = torch.cat([psi.cos(), psi.sin()], dim=-1)
@@ -98,7 +116,7 @@ class Odometry:
         elapsed = track.elapsed[..., None]
         columns = [
             turn(heading, direction),  # 2
-            turn(velocity, direction),  # 2
+            turn(track.velocity, direction),  # 2
             self.part.turn_rate(proprio)[..., None] / 4,  # 1
             turn(track.position - track.start, direction).clamp(-2, 2),  # 2
             target.clamp(-2, 2), (target * 5).clamp(-2, 2),  # 4
@@ -117,10 +135,15 @@ def turn(vector: Tensor, direction: Tensor) -> Tensor:
         vector: in the axes of the map.
         direction: unit vector of the instruction; zero for `stay`, whose frame is the map's.
     """
-    east = direction.new_tensor([1.0, 0.0])
-    axis = torch.where((direction == 0).all(dim=-1, keepdim=True), east, direction)
+    axis = axis_of(direction)
     turned = turn_to_instruction(vector[..., 0], vector[..., 1], axis[..., 0], axis[..., 1])
     return torch.stack(turned, dim=-1)
+
+
+def axis_of(direction: Tensor) -> Tensor:
+    """Return the unit vectors of the frames of instructions, [..., 2]: their directions; east where they are zero."""
+    east = direction.new_tensor([1.0, 0.0])
+    return torch.where((direction == 0).all(dim=-1, keepdim=True), east, direction)
 
 
 def _follow(track: Track, velocity: Tensor, direction: Tensor, terminated: Tensor, heading: Tensor) -> Track:

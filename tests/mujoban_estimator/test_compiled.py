@@ -3,20 +3,16 @@ import pytest
 import torch
 
 import mujoban_estimator
+from mujoban_core.bodies import get_body
 from mujoban_core.files import digest
 from mujoban_core.interfaces import EstimatorInput, TerminationInput
 from mujoban_estimator.estimator import StateEstimator, probabilities
 from mujoban_estimator.export import export_estimator, export_termination
-from mujoban_estimator.termination import ControlTermination
+from mujoban_estimator.termination import ControlTermination, parts_of
 from mujoban_rl.compiled import CompiledGraph, Signature, graph_path
 from mujoban_rl.export import export_graph
 from mujoban_rl.testing import robot_ticks
 from mujoban_rl.weights import save_weights
-
-
-def leaves(memory):
-    hidden, cell, track = memory
-    return hidden, cell, *track
 
 
 @pytest.mark.parametrize("body", ["ball", "ant"])
@@ -33,11 +29,11 @@ def test_beta_follows_from_the_graph_as_in_pytorch(tmp_path, body):
     plain = mujoban_estimator.load_termination(weights, compiled=False)
     assert compiled.compiled is not None and plain.compiled is None
     a, b = compiled.initial_memory(1), plain.initial_memory(1)
-    size = plain.lstm.input_size - plain.config.camera - 24
+    size = get_body(body).proprio_size
     for inputs in robot_ticks(TerminationInput, 30, size, np.random.default_rng(0)):
         (said, a), (expected, b) = compiled.probability(inputs, a), plain.probability(inputs, b)
         assert said.shape == (1,) and np.allclose(said, expected, atol=1e-3)
-        pairs = list(zip(leaves(a), leaves(b), strict=True))
+        pairs = list(zip(parts_of(a), parts_of(b), strict=True))
         assert all(x.shape == y.shape and np.allclose(x, y, atol=1e-3) for x, y in pairs)
 
 

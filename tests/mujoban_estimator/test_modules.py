@@ -3,11 +3,15 @@ import pytest
 import torch
 
 from mujoban_core.bodies import ANT, BALL
-from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, Instruction
+from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, OFFSETS_XY, Instruction
 from mujoban_core.interfaces import EstimatorInput, TerminationInput, renew_rows
+from mujoban_estimator.bearings import Bearings, follow
 from mujoban_estimator.estimator import Belief, StateEstimator
 from mujoban_estimator.odometry import FEATURES, Odometry
 from mujoban_estimator.termination import ControlTermination
+from mujoban_rl.sight.orientation import SIGHT
+from mujoban_rl.sight.place import PLACE, phases, phases_along
+from mujoban_rl.sight.skyline import HEADINGS, unit
 from mujoban_rl.weights import WeightsError, load_weights, save_weights
 
 TICKS = 9
@@ -167,47 +171,88 @@ def test_a_body_without_a_compass_comes_back_to_where_it_began_after_a_circle(le
     proprio[..., ANT.proprio.up_axis] = up
     proprio[:, 1:, ANT.proprio.angular_velocity] = up * 2 * np.pi / (ticks * CONTROL_PERIOD)
     stay, no = torch.zeros(1, ticks, dtype=torch.int64), torch.zeros(1, ticks, dtype=torch.bool)
-    half, _ = odometry(proprio[:, : ticks // 2], stay[:, : ticks // 2], no[:, : ticks // 2], odometry.initial(1))
-    _, there = odometry(proprio, stay, no, odometry.initial(1))
-    assert half.shape == (1, ticks // 2, FEATURES)
+    heading = (CONTROL_PERIOD * ANT.proprio.turn_rate(proprio)).cumsum(1)
+    tracks = odometry.follow(proprio, stay, no, odometry.initial(1), heading)
+    assert odometry.features(proprio, tracks).shape == (1, ticks, FEATURES)
     # A circle of 15 m, in cells of 3 m.
-    assert there.position.abs().max() < 0.05
-    _, far = odometry(proprio[:, : ticks // 2], stay[:, : ticks // 2], no[:, : ticks // 2], odometry.initial(1))
-    assert float(far.position.norm()) == pytest.approx(5.0 / np.pi, abs=0.05)
+    assert tracks.position[0, -1].abs().max() < 0.05
+    assert float(tracks.position[0, ticks // 2 - 1].norm()) == pytest.approx(5.0 / np.pi, abs=0.05)
+
+
+QUARTERS = (Instruction.EAST, Instruction.NORTH, Instruction.WEST, Instruction.SOUTH)
+
+
+def made_for(body):
+    torch.manual_seed(0)
+    return ControlTermination(body=body.name, stem=8, channels=8, blocks=1, camera=8, hidden=8).eval()
 
 
 @pytest.mark.parametrize("body", [BALL, ANT], ids=lambda body: body.name)
-def test_odometry_in_bits_equals_odometry_at_once(body, rng):
-    odometry = Odometry(body)
+def test_progress_in_bits_equals_progress_at_once(body, rng):
+    module = made_for(body)
     proprio = torch.from_numpy(rng.normal(size=(2, 20, body.proprio_size)).astype(np.float32))
     instruction = torch.from_numpy(rng.integers(0, 5, (2, 20)))
     terminated = torch.from_numpy(rng.random((2, 20)) < 0.2)
-    whole, _ = odometry(proprio, instruction, terminated, odometry.initial(2))
-    track, parts = odometry.initial(2), []
+    shown = None if module.bearings is None else torch.from_numpy(rng.normal(size=(2, 20, SIGHT + PLACE))).float()
+    track, needles = module.odometry.initial(2), module.initial_needles(2)
+    whole = module.progress(shown, proprio, instruction, terminated, track, needles)
+    parts = []
     for t in range(20):
-        part, track = odometry(
-            proprio[:, t : t + 1], instruction[:, t : t + 1], terminated[:, t : t + 1], track
-        )
-        parts.append(part)
-    torch.testing.assert_close(whole, torch.cat(parts, 1))
+        one = (x[:, t : t + 1] for x in (proprio, instruction, terminated))
+        part = module.progress(None if shown is None else shown[:, t : t + 1], *one, track, needles)
+        track, needles = part.track, part.needles
+        parts.append(part.features)
+    torch.testing.assert_close(whole.features, torch.cat(parts, 1))
+    for last, at_once in zip(needles, whole.needles, strict=True):
+        torch.testing.assert_close(last, at_once)
 
 
-def test_termination_steps_equal_training_on_an_instruction(termination, rng):
-    frame = frames(rng, 1, 6)
-    proprio = rng.normal(size=(1, 6, BALL.proprio_size)).astype(np.float32)
+@pytest.mark.parametrize("quarter", [0, 1, 2, 3])
+def test_an_ant_that_sees_where_it_is_knows_the_way_left_whatever_it_began_with(quarter):
+    """It walks half a cell as instructed, facing 20 degrees off; its odometer and the needles begin wrong."""
+    bearings, odometry, ticks = Bearings(ANT, 8), Odometry(ANT), 60
+    direction = torch.tensor(OFFSETS_XY[list(QUARTERS)])
+    psi = torch.tensor(quarter * np.pi / 2 + np.deg2rad(20.0), dtype=torch.float32)
+    # The first half of the ticks it stands, and the needles settle.
+    way = (torch.arange(1, ticks + 1) - ticks // 2).clamp(min=0)[:, None] / ticks * direction[quarter].float()
+    middle = torch.tensor([1.5, -0.5])
+    pose = torch.cat([ANT.cell_size * (middle + way), psi.expand(ticks, 1)], 1)
+    proprio = torch.zeros(1, ticks, ANT.proprio_size)
+    proprio[..., ANT.proprio.up_axis] = torch.tensor([0.0, 0.0, 1.0])
+    speed = ANT.cell_size / (ticks * CONTROL_PERIOD)
+    across = torch.tensor([np.cos(np.deg2rad(20.0)), -np.sin(np.deg2rad(20.0))])
+    proprio[0, ticks // 2 :, ANT.proprio.planar_velocity] = (speed * across).float()
+    heading = torch.zeros(ticks, SIGHT)
+    heading[:, round(float(psi) / (2 * np.pi) * HEADINGS) % HEADINGS] = 12.0
+    heading[:, HEADINGS:] = unit(4 * psi)
+    shown = torch.cat([heading, phases_along(phases(pose, ANT.cell_size), direction[quarter].float())], -1)
+    instruction = torch.full((1, ticks), int(QUARTERS[quarter]))
+    issued = torch.zeros(1, ticks, dtype=torch.bool)
+    issued[0, ticks // 2] = True
+    track = odometry.initial(1)._replace(position=torch.tensor([[0.4, -3.3]]))
+    progress = follow(bearings, odometry, shown[None], proprio, instruction, issued, track, bearings.initial(1))
+    left = progress.features[0, -1, FEATURES + PLACE : FEATURES + PLACE + 2]
+    np.testing.assert_allclose(left.numpy(), [0.5, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize("body", [BALL, ANT], ids=lambda body: body.name)
+def test_termination_steps_equal_training_on_an_instruction(body, rng):
+    module, frame = made_for(body), frames(rng, 1, 6)
+    proprio = rng.normal(size=(1, 6, body.proprio_size)).astype(np.float32)
     instruction, terminated = np.full((1, 6), 2), np.zeros((1, 6), bool)
-    memory, stepped = termination.initial_memory(1), []
+    memory, stepped = module.initial_memory(1), []
     for t in range(6):
         inputs = TerminationInput(frame[:, t], proprio[:, t], instruction[:, t], terminated[:, t])
-        p, memory = termination.probability(inputs, memory)
+        p, memory = module.probability(inputs, memory)
         stepped.append(p[0])
+    felt, *said = (torch.from_numpy(x) for x in (proprio, instruction, terminated))
     with torch.inference_mode():
-        progress, _ = termination.odometry(
-            torch.from_numpy(proprio), torch.from_numpy(instruction), torch.from_numpy(terminated),
-            termination.odometry.initial(1),
-        )  # fmt: skip
-        features = termination.encoder(torch.from_numpy(frame[0]))[None]
-        output = termination(features, progress, torch.from_numpy(proprio), *termination.initial_recurrence(1))
+        images = torch.from_numpy(frame[0])
+        seen = module.look(module.encoder(images))
+        shown = module.read(images, seen, felt[0])
+        start = module.odometry.initial(1), module.initial_needles(1)
+        progress = module.progress(None if shown is None else shown[None], felt, *said, *start)
+        output = module(seen[None], progress.features, felt, *module.initial_recurrence(1))
     np.testing.assert_allclose(stepped, torch.sigmoid(output.logits[0]).numpy(), atol=1e-4)
 
 

@@ -2,6 +2,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 
 from bringup.command import Choice, Stack
 from bringup.exploration import Disturbance
@@ -9,7 +10,7 @@ from bringup.record import Job, MixedEpisodes, record
 from bringup.rollout import Ending, Tick
 from bringup.rollout_recorder import TOPICS as RECORDED
 from bringup.rollout_recorder import Recorder
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import ANT, BALL
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import GroundTruth, Observation, TerminationOutput
 from mujoban_core.plugins import ROLES
@@ -188,20 +189,26 @@ def test_a_stream_goes_on_amid_a_bag_that_was_kept(bags):
     assert all(same(next(resumed), next(stream)) for _ in range(6))
 
 
-def stretch(ticks, *, first=True, terminated=(), completed=()):
+def stretch(ticks, *, first=True, terminated=(), completed=(), body=BALL):
     rng = np.random.default_rng(ticks)
     state = MixedEpisodes(1, SEED, [1])[0].level.abstract_state()
     flags = np.arange(ticks)
     return Stretch(
         rng.integers(0, 256, (ticks, 64, 64, 3), dtype=np.uint8),
         np.tile(np.float32([-0.5, 0.5, 0.0]), (ticks, 1)),
-        np.zeros((ticks, BALL.proprio_size), np.float32),
+        np.tile(upright(body), (ticks, 1)),
         np.ones(ticks, np.int64),
         np.isin(flags, terminated),
         np.isin(flags, completed),
         np.repeat(state[None], ticks, 0),
         first,
     )
+
+
+def upright(body):
+    proprio = np.zeros(body.proprio_size, np.float32)
+    proprio[body.proprio.up_axis] = (0.0, 0.0, 1.0)
+    return proprio
 
 
 def test_windows_are_whole_instructions_from_their_issue():
@@ -233,12 +240,16 @@ def test_cells_stay_seen_until_the_next_episode():
     assert not (third.seen[:, -1] & first.in_view[:, 0]).all() and third.seen.sum() < second.seen.sum()
 
 
-def test_a_learner_fits_what_it_sees_again_and_again():
-    config = TrainConfig(LearnerConfig(window_frames=16), streams=1, learning_rate=3e-3, warm_up=0.0)
+@pytest.mark.parametrize("body", [BALL, ANT], ids=lambda body: body.name)
+def test_a_learner_fits_what_it_sees_again_and_again(body):
+    both = EstimatorConfig(body=body.name), TerminationConfig(body=body.name)
+    config = TrainConfig(LearnerConfig(*both, window_frames=16), streams=1, learning_rate=3e-3, warm_up=0.0)
     learner = EstimatorLearner(config)
-    batch = next(Batcher([iter([stretch(16, terminated=(8,), completed=(7, 14, 15))])], 16, BALL))
-    losses = [learner.update(batch, 0.0, NaNGuard())["train/loss"] for _ in range(31)]
-    assert losses[-1] < 0.6 * losses[0]
+    batch = next(Batcher([iter([stretch(16, terminated=(8,), completed=(7, 14, 15), body=body)])], 16, body))
+    parts = [learner.update(batch, 0.0, NaNGuard()) for _ in range(31)]
+    assert parts[-1]["train/loss"] < 0.6 * parts[0]["train/loss"]
+    if body.heading_index is None:  # it learns where it faces and stands, too
+        assert parts[-1]["train/bearings"] < 0.6 * parts[0]["train/bearings"]
 
 
 def test_shards_learn_what_the_whole_batch_teaches():
@@ -312,6 +323,25 @@ def test_weights_of_another_configuration_are_no_start(other, tmp_path):
     with pytest.raises(WeightsError, match=r"estimator.safetensors: weights of .*, expected those of"):
         learner(EstimatorConfig(channels=8, blocks=1)).start_from(tmp_path)
     learner(other, limit=90).start_from(tmp_path)
+
+
+def test_a_start_from_another_body_lends_what_does_not_depend_on_it(tmp_path):
+    def learner(body, out=None):
+        sizes = {"body": body, "channels": 8, "blocks": 1}
+        both = LearnerConfig(EstimatorConfig(**sizes), TerminationConfig(**sizes))
+        return EstimatorLearner(TrainConfig(both), out=out)
+
+    ball, ant = learner("ball", tmp_path), learner("ant")
+    for weights in ball.termination.parameters():
+        torch.nn.init.normal_(weights)
+    ball.export(RunDirectory(tmp_path / "run", ball.training), {})
+    ant.start_from(tmp_path)
+    for role, own in ant.modules.items():
+        lent = ball.modules[role].state_dict()
+        for name, weights in own.state_dict().items():
+            fits = name in lent and lent[name].shape == weights.shape
+            assert fits != name.startswith(("bearings.", "lstm.weight_ih"))
+            assert not fits or torch.equal(weights, lent[name])
 
 
 @pytest.mark.parametrize(

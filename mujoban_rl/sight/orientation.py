@@ -19,9 +19,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.skyline import HEADINGS, Skyline, heading_loss, unit
 from mujoban_core.bodies import Body
 from mujoban_core.grid import CONTROL_PERIOD, turn_to_instruction
+from mujoban_rl.sight.skyline import HEADINGS, Skyline, heading_loss, unit
 
 _QUARTERS: Final = 4
 NEEDLE: Final = _QUARTERS + 2
@@ -33,6 +33,8 @@ _REMEMBERED: Final = 0.995
 """Share of the odds that stays from tick to tick: the skyline is out of view for long."""
 _KEPT: Final = 0.9
 """The same for the hand, so that it settles within a second."""
+_SURE: Final = 10.0
+"""Log odds of the right quarter after a look around."""
 _QUARTER: Final = math.tau / _QUARTERS
 _SHORTEST: Final = 1e-3
 
@@ -73,6 +75,14 @@ class Compass(nn.Module):
         passed = torch.round((_fine(hand) + turned - fine) / _QUARTER)
         odds = _REMEMBERED * _roll(odds, passed.long()) + _evidence(shown[..., :HEADINGS].detach(), fine)
         return torch.cat([odds, after], -1)
+
+
+def needle_towards(heading: Tensor) -> Tensor:
+    """Return needles that have come to point to headings in radians, [B] to [B, `NEEDLE`]."""
+    hand = unit(_QUARTERS * heading)
+    quarter = torch.round((heading - _fine(hand)) / _QUARTER).long() % _QUARTERS
+    odds = _SURE * (functional.one_hot(quarter, _QUARTERS) - 1.0 / _QUARTERS)
+    return torch.cat([odds, hand / (1.0 - _KEPT)], -1)
 
 
 def sight_loss(shown: Tensor, heading: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""How a controller keeps where in its cell the robot is."""
+"""How where in its cell a robot is, is kept."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ import math
 import pytest
 import torch
 
-from mujoban_controller.controller import VisuomotorController
-from mujoban_controller.distil import DistilConfig, GoalHead, imitation_loss
-from mujoban_controller.place import PLACE, Place, cells_off, phases, phases_along, place_loss, way_left
-from mujoban_core.bodies import ANT, BALL
+from mujoban_rl.sight.place import PLACE, Place, cells_off, phases, phases_along, place_loss, way_left
 
 POSES = torch.tensor(
     [[1.5, -0.5, 0.3], [1.6, -0.7, 0.3], [-2.2, 3.35, 1.8], [0.9, 0.1, -1.4], [-3.3, -1.05, 3.0], [2.0, 2.0, -2.9]]
@@ -69,32 +66,3 @@ def test_the_way_left_is_the_way_to_the_cell_beside_that_in_which_the_instructio
     way = way_left(place, since, torch.tensor([step]))
     torch.testing.assert_close(way, torch.tensor([[1.5, -0.5]]) + torch.tensor([step]) - began - since)
     assert not way.requires_grad
-
-
-def test_there_is_no_way_without_a_place() -> None:
-    with pytest.raises(ValueError, match="way without place"):
-        VisuomotorController("ant", (8, 8), 16, 8, way=True)
-
-
-@pytest.mark.parametrize("way", [False, True])
-@pytest.mark.parametrize("body", [BALL, ANT])
-def test_the_place_counts_in_the_loss_of_distillation_and_reaches_the_policy(body, way) -> None:
-    torch.manual_seed(0)
-    m, w = 3, 4
-    controller = VisuomotorController(body.name, (8, 8), 16, 8, place=True, way=way)
-    output = controller(
-        torch.randint(0, 255, (m, w, 64, 64, 3), dtype=torch.uint8), torch.randn(m, w, body.proprio_size),
-        torch.randint(0, 5, (m, w)), torch.zeros(m, w, dtype=torch.bool), controller.initial_memory(m),
-    )  # fmt: skip
-    assert output.place is not None and controller.place is not None
-    reading = controller.place.read.weight
-    (gradient,) = torch.autograd.grad(output.action.mean.square().sum(), reading, retain_graph=True)
-    assert gradient.abs().sum() > 0
-    batch = {
-        "label": torch.zeros(m, w, body.action_size), "kind": torch.zeros(m, w, dtype=torch.int64),
-        "instruction": torch.ones(m, w, dtype=torch.int64), "goal": torch.zeros(m, w, 4), "pose": torch.ones(m, w, 3),
-    }  # fmt: skip
-    loss, statistics = imitation_loss(output, GoalHead(24), batch, DistilConfig(), body.cell_size)
-    loss.backward()
-    assert reading.grad is not None and reading.grad.abs().sum() > gradient.abs().sum()
-    assert 0.0 <= float(statistics["error/place"]) <= 0.5

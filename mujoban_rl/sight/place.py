@@ -17,8 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_controller.skyline import unit
 from mujoban_core.grid import turn_to_instruction
+from mujoban_rl.sight.skyline import unit
 
 PLACE: Final = 4
 """Components of the needles: cosines of the phases along two axes, then their sines; zero in the middle of a cell."""
