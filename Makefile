@@ -29,7 +29,8 @@ setup: $(STAMP)
 $(INSTALLED): $(INPUTS) bringup/check_machine.py
 	@$(PYTHON) bringup/check_machine.py
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --editable '.[dev]'
+	@$(BIN)/python -m compileall -qq -j $$(nproc) .venv/lib/python3*/site-packages || true  # pip does so on one core; some files are templates
 	@touch $@
 
 $(STAMP): $(INSTALLED)
