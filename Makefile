@@ -29,7 +29,11 @@ setup: $(STAMP)
 $(INSTALLED): $(INPUTS) bringup/check_machine.py
 	@$(PYTHON) bringup/check_machine.py
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --no-compile --editable '.[dev]'
+	@# What builds the messages is needed to run, too: no environment of its own for it.
+	@$(BIN)/python -c "import tomllib; \
+	  print(*tomllib.load(open('pyproject.toml', 'rb'))['build-system']['requires'], sep='\n')" > .venv/build-requires.txt
+	$(BIN)/python -m pip install --quiet --no-compile --requirement .venv/build-requires.txt
+	$(BIN)/python -m pip install --quiet --no-compile --no-build-isolation --editable '.[dev]'
 	@$(BIN)/python -m compileall -qq -j $$(nproc) .venv/lib/python3*/site-packages || true  # pip does so on one core; some files are templates
 	@touch $@
 

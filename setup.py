@@ -19,12 +19,13 @@ if not (Path(sysconfig.get_path("include")) / "Python.h").exists():
     sys.exit("setup.py: error: no Python headers to build the ROS messages with: apt-get install python3-dev")
 
 MESSAGES, GENERATED = HERE / "mujoban_msgs_py", HERE / "build" / "rosidl"
-messages = extension(MESSAGES, GENERATED, HERE)
+# A frontend asks for requirements and metadata first, for which nothing has to be generated.
+building = not {"egg_info", "dist_info"} & set(sys.argv)
 
 setup(
     # A root of "." makes an editable install one path entry, so that it finds packages added later as well.
     package_dir={"": "."},
-    packages=sorted({*find_packages(include=PACKAGES), PACKAGE, f"{PACKAGE}.msg"}),
-    ext_modules=[messages],
-    data_files=ament_files(MESSAGES, GENERATED),
+    ext_modules=[extension(MESSAGES, GENERATED, HERE)] if building else [],
+    data_files=ament_files(MESSAGES, GENERATED) if building else [],
+    packages=sorted({*find_packages(include=PACKAGES), *((PACKAGE, f"{PACKAGE}.msg") if building else ())}),
 )
