@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from benchmarks.paper import bodies
 from benchmarks.paper.runs import ALL, ROOT, load
 from bringup import model_card
 from bringup.model_card import Place, Score
@@ -46,7 +47,7 @@ def _scores(digest: str | None) -> list[Score]:
             run.title, ", ".join(run.oracle) or "none", len(report["episodes"]), report["success_rate"],
             report["success_interval"],
         )
-        for run in ALL
+        for run in {run.name: run for run in (*bodies.RUNS, *ALL)}.values()
         if (report := load(run)) is not None and digest in report["weights"].values()
     ]
 

@@ -54,7 +54,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "The camera frame, proprioception, the instruction and its own last answer. No pose, no ground truth.",
         "Relies on dead reckoning: a robot that slips for long, or is moved, misleads it. Knows no box that it "
         "does not see.",
-        "an instruction ends after 120 ticks at the latest; dead reckoning and the instruction's frame feed it",
+        "an instruction ends after 120 ticks at the latest; dead reckoning and the instruction's frame feed it, and, "
+        "where no heading is felt, filters of the heading and of the place in a cell that it reads from frames",
         {"": "supervised, by the rule of completion in recorded bags"},
         "estimator",
     ),

@@ -53,7 +53,8 @@ and reports the best of many settings; here steps and CPU hours are what the row
 FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
 where one begins, and the axes of rates are cut. The [model cards](../models/) have the scores of the weights that ship.
 """
-FIGURE_5 = """With ground-truth sense, as in the paper; the planner is the one that ships, and knows of no body.
+FIGURE_5 = """With ground-truth sense, as in the paper, but for the last row. The planner is the one that ships, and
+knows of no body.
 """
 TABLE_2 = """Each configuration replaces modules by oracles.
 """

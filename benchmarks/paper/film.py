@@ -20,7 +20,7 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from benchmarks.paper import bodies, runs
+from benchmarks.paper import runs
 from benchmarks.paper.runs import SEED, SENSE, ResultError, read_source
 from bringup.command import Choice, Stack, oracle
 from bringup.rollout import ticks
@@ -67,11 +67,7 @@ FILMS: Final = {
     BALL.name: Film("film_strip", Stack()),
     ANT.name: Film(
         "film_strip_ant",
-        Stack(
-            {role: oracle(role, ANT.name) if role in SENSE else Choice(role) for role in ROLES}
-            | {"controller": Choice("controller", weights=bodies.CONTROLLERS[ANT.name])},
-            body=ANT.name,
-        ),
+        Stack({role: oracle(role, ANT.name) if role in SENSE else Choice(role) for role in ROLES}, body=ANT.name),
     ),
 }
 """By the body that is seen; what the ant senses is known, as in Figure 5."""

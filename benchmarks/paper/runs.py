@@ -157,7 +157,8 @@ def is_stale(report: dict[str, Any], run: Run | None = None) -> bool:
 
     What is to play and is not on this machine counts as what played: the weights of agents do not ship.
     """
-    current = {role: shipped_weights(role) for role in (*ROLES, SCOUT)} | ({} if run is None else run.own)
+    body, own = (None, {}) if run is None else (run.body, run.own)
+    current = {role: shipped_weights(role, body) for role in (*ROLES, SCOUT)} | own
     told = {role: name.removesuffix(PRIVILEGED) for role, name in report["weights"].items() if role in current}
     return any(
         len(name) == DIGEST_LENGTH and current[role].is_file() and name != digest(current[role])

@@ -74,7 +74,7 @@ def test_imitation_that_is_terminated_and_resumed_equals_one_that_never_stopped(
         runs.append(_imitation(path, where, stock=1, enough=200, levels=2))
         return runs[-1]
 
-    check_resuming(make, tmp_path, stop_at=5, updates=7)
+    check_resuming(make, tmp_path, stop_at=3, updates=5)
     source = [run for run in runs if run.directory.path.name == "parts"][-1].source
     assert all(n > 0 for n in source.statistics().values()), "its own play was not corrected"
     assert (source.worker_cpu_seconds() > 0.0) == (actors == "processes")
