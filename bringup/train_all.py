@@ -18,16 +18,15 @@ if __name__ == "__main__":
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Final
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from bringup.options import Count, WorldOptions, whole
 from bringup.pipeline import Pipeline, Stage
+from bringup.training_display import Display
 from bringup.training_report import EVALUATIONS, write_report
 from bringup.training_sizes import Machine
 from mujoban_core.bodies import BALL, get_body
@@ -95,6 +94,10 @@ _STUDENT: Final = (
 )  # fmt: skip
 """The student sees more of instructions that failed before, and of STAYs, which the stack asks for often; what it is to
 do under pushes that are not possible weighs less, so that it tries those where it can't tell."""
+_TURNING: Final = (
+    "--task.instructions.stay", "0.2", "--task.instructions.stays-on", "0.985", "--task.reward.heading", "0.15",
+)  # fmt: skip
+"""For a teacher whose body no single action turns: it is told to stay, where it turns, often enough to learn to."""
 _SENSES: Final = ("--learner.slip", "0.015", "--learner.lost", "0.05")
 """How far the odometer is off in training of estimator and termination."""
 _VIEWS: Final = ("--noise", "0.1", "--hidden", "0.3")
@@ -202,16 +205,19 @@ def _controller(options: Options) -> list[Stage]:
     judged = max(4, min(64, round(_JUDGED_PER_HOUR * options.hours)))
     every = round(min(max(1.0, options.hours), 4.0) * _EVALUATED_STEPS)
     common += ("--steps", str(_STEPS), "--evaluate-every", str(every), "--evaluation-episodes", str(judged))
-    train = "mujoban_controller.train"
+    train, body = "mujoban_controller.train", get_body(options.physics.body)
+    turning = _TURNING if body.turn is None else ()
+    # Who finds the heading by sight looks around first, as in the stack.
+    look = ("--task.look", str(body.look_ticks)) if body.heading_index is None else ()
     return [
         _trainer(
             options, "teacher", (train, "--stage", "teacher", "--algorithm", "mpo", *common,
-            *_from_before(options, "--initial", "teacher")), teacher, beside=(_CRITIC,),
+            *turning, *_from_before(options, "--initial", "teacher")), teacher, beside=(_CRITIC,),
             sources=_sources(options, "teacher"),
         ),
         _trainer(
             options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common,
-            *_STUDENT, *_from_before(options, "--initial", "controller")), student, "teacher",
+            *_STUDENT, *look, *_from_before(options, "--initial", "controller")), student, "teacher",
             sources=_sources(options, "controller"),
         ),
         _trainer(
@@ -323,50 +329,6 @@ def _evaluation(options: Options, name: str) -> Stage:
     )  # fmt: skip
     needs = ("estimator_second", "planner_views", "controller_mpo")
     return Stage(name, command, (report,), needs, _seconds(options, name))
-
-
-class Display:
-    """A line a stage: what it has taken of what it may take, and when all are expected to be done.
-
-    A pipe or file is told when each begins and ends.
-    """
-
-    def __init__(self, pipeline: Pipeline, console: Console) -> None:
-        """Show that all stages wait."""
-        columns = (TextColumn("{task.description}"), BarColumn(None), TextColumn("{task.fields[note]}"))
-        self.progress = Progress(
-            *columns, console=console, refresh_per_second=1, expand=True, disable=not console.is_interactive
-        )
-        self._all = self.progress.add_task("all", total=1.0, note="")
-        self._tasks: dict[str, TaskID] = {
-            s.name: self.progress.add_task(s.name, total=s.seconds, note="waits") for s in pipeline.stages
-        }
-        self._states = dict.fromkeys(self._tasks, "waits")
-
-    def update(self, pipeline: Pipeline) -> None:
-        """Show how far every stage is."""
-        remaining = pipeline.remaining()
-        ends = f"{datetime.now() + timedelta(seconds=remaining):%a %H:%M}"
-        passed = pipeline.seconds() / (pipeline.seconds() + remaining) if remaining else 1.0
-        self.progress.update(self._all, completed=passed, note=f"expected to end on {ends}")
-        for stage in pipeline.stages:
-            spent, done = pipeline.elapsed(stage.name), pipeline.entries[stage.name].done
-            if done:
-                state, note = "done", f"done in {_minutes(spent)}"
-            elif stage.name in pipeline.running():
-                state, note = "runs", f"{_minutes(spent)} of about {_minutes(stage.seconds)}"
-            else:
-                state = note = "waits"
-            shown = stage.seconds if done else min(spent, stage.seconds)
-            self.progress.update(self._tasks[stage.name], completed=shown, note=note)
-            if self.progress.disable and state != self._states[stage.name]:
-                line = f"{stage.name}: {note}" + ("" if done else f"; all is expected to end on {ends}")
-                self.progress.console.print(line, highlight=False, soft_wrap=True)
-            self._states[stage.name] = state
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s"
 
 
 def train_all(options: Options) -> Path:

@@ -12,7 +12,7 @@ from bringup.monitor import Watched
 from bringup.pipeline import Pipeline, Stage
 from bringup.progress import EpisodesBar, SolvedBar
 from bringup.results import EpisodeResult, Failure
-from bringup.train_all import Display
+from bringup.training_display import Display
 from bringup.view import live_view, summary
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.conversions import InstructionReading, TerminationReading

@@ -77,6 +77,13 @@ def test_a_run_whose_bags_are_gone_is_continued_with_new_ones_alone(tmp_path: Pa
     assert first[first.index("--bags") + 1 : first.index("--out")] == (str(run / PRODUCTS["first"]),)
 
 
+def test_a_body_that_finds_its_heading_by_sight_looks_around_before_it_learns(tmp_path: Path) -> None:
+    ball, ant = (commands(Options(run=tmp_path, physics=WorldOptions(body))) for body in ("ball", "ant"))
+    student = ant["controller_distil"]
+    assert student[student.index("--task.look") + 1] == "50" and "--task.look" not in ball["controller_distil"]
+    assert "--task.instructions.stay" in ant["teacher"] and "--task.instructions.stay" not in ball["teacher"]
+
+
 @pytest.mark.parametrize("name", EVALUATIONS)
 def test_an_evaluation_plays_levels_by_which_nothing_is_chosen(tmp_path: Path, name: str) -> None:
     command = commands(Options(run=tmp_path))[name]

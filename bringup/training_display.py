@@ -1,0 +1,54 @@
+"""What a terminal shows of a run of all trainings."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from bringup.pipeline import Pipeline
+
+
+class Display:
+    """A line a stage: what it has taken of what it may take, and when all are expected to be done.
+
+    A pipe or file is told when each begins and ends.
+    """
+
+    def __init__(self, pipeline: Pipeline, console: Console) -> None:
+        """Show that all stages wait."""
+        columns = (TextColumn("{task.description}"), BarColumn(None), TextColumn("{task.fields[note]}"))
+        self.progress = Progress(
+            *columns, console=console, refresh_per_second=1, expand=True, disable=not console.is_interactive
+        )
+        self._all = self.progress.add_task("all", total=1.0, note="")
+        self._tasks: dict[str, TaskID] = {
+            s.name: self.progress.add_task(s.name, total=s.seconds, note="waits") for s in pipeline.stages
+        }
+        self._states = dict.fromkeys(self._tasks, "waits")
+
+    def update(self, pipeline: Pipeline) -> None:
+        """Show how far every stage is."""
+        remaining = pipeline.remaining()
+        ends = f"{datetime.now() + timedelta(seconds=remaining):%a %H:%M}"
+        passed = pipeline.seconds() / (pipeline.seconds() + remaining) if remaining else 1.0
+        self.progress.update(self._all, completed=passed, note=f"expected to end on {ends}")
+        for stage in pipeline.stages:
+            spent, done = pipeline.elapsed(stage.name), pipeline.entries[stage.name].done
+            if done:
+                state, note = "done", f"done in {_minutes(spent)}"
+            elif stage.name in pipeline.running():
+                state, note = "runs", f"{_minutes(spent)} of about {_minutes(stage.seconds)}"
+            else:
+                state = note = "waits"
+            shown = stage.seconds if done else min(spent, stage.seconds)
+            self.progress.update(self._tasks[stage.name], completed=shown, note=note)
+            if self.progress.disable and state != self._states[stage.name]:
+                line = f"{stage.name}: {note}" + ("" if done else f"; all is expected to end on {ends}")
+                self.progress.console.print(line, highlight=False, soft_wrap=True)
+            self._states[stage.name] = state
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 60 else f"{seconds:.0f} s"
