@@ -22,6 +22,7 @@ from bringup.reporting import Reporting, played
 from mujoban_controller import teacher_weights
 from mujoban_core.bodies import ANT
 from mujoban_core.files import digest
+from mujoban_core.plugins import shipped_weights
 from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import open_bag
@@ -383,7 +384,9 @@ def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capf
     content = json.loads(report.read_text())
     assert content["body"] == "ant"
     assert f"controller: weights {content['weights']['controller'][:12]}\n" in capfd.readouterr().out
-    assert run(evaluate, *few, *oracles) == 0, "by default it plays with the weights that ship for it"
+    assert run(evaluate, *few, "--json", report) == 0, "by default it plays with the weights that ship for it"
+    told = {role: digest(shipped_weights(role, "ant")) for role in ("estimator", "termination", "controller")}
+    assert json.loads(report.read_text())["weights"].items() >= told.items()
     unfit = ["--controller", teacher_weights("ball")]
     assert run(evaluate, *few, *oracles, *unfit) == 2
     error = capfd.readouterr().err
