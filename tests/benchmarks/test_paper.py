@@ -307,13 +307,17 @@ def test_the_planners_curves_have_the_names_that_are_given(tmp_path, drawn):
 
 
 def test_figure_5_has_both_bodies_and_marks_a_controller_that_is_another_now(folder):
-    shipped = {role: digest(shipped_weights(role)) for role in ROLES}
-    ant = bodies.BODIES["ant"]
+    shipped = {role: digest(shipped_weights(role, "ant")) for role in ROLES}
+    ant, camera = bodies.BODIES["ant"], bodies.BODIES["ant_camera"]
     write(ant[4], 3, 4, {**shipped, "controller": f"{digest(ant[4].own['controller'])} (privileged)"})
     write(ant[3], 4, 4, {**shipped, "controller": f"{'0' * 64} (privileged)"})
+    write(camera[4], 4, 4, shipped)
+    write(camera[3], 4, 4, {role: digest(shipped_weights(role)) for role in ROLES})  # the ball's
     assert results.rebuild(folder) == folder / "README.md"
     page = (folder / "README.md").read_text()
     assert "| ant, by ground truth (privileged), difficulty 5 | `ant_5` |" in page and "| 73.7 % |" in page
     assert f"| ant, by ground truth (privileged), difficulty 4{tables.STALE} | `ant_4` |" in page
+    assert "| ant, by its camera, difficulty 5 | `ant_camera_5` |" in page
+    assert f"| ant, by its camera, difficulty 4{tables.STALE} | `ant_camera_4` |" in page
     assert (folder / "figure5.png").stat().st_size
     assert [o for o in ant[4].options() if o in ("--body", "ant")] == ["--body", "ant"]
