@@ -262,8 +262,8 @@ class EstimatorLearner(Learner[Batch]):
         for rows in (slice(*both) for both in pairwise(bounds)):
             part = Batch._make(values[rows] for values in batch)
             windows = choose_windows(part, frames, self.config.window_length, self.rng)
-            count = 0 if self.termination.bearings is None else len(windows.stream)
-            off = self.rng.normal(size=(count, 3)).astype(np.float32)
+            kept = 0 if self.termination.bearings is None else len(windows.stream)
+            off = self.rng.normal(size=(kept, 3)).astype(np.float32)
             yield _Shard(part, windows, Belief(*(b[rows] for b in belief)), Track(*(t[rows] for t in track)), off)
 
     def _gradients(self, shard: _Shard) -> _Learned:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import re
+from contextlib import suppress
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Final
 
+from mujoban_core.signals import StopSignal
 from mujoban_msgs_py.bags import BagError, BagWriter
 from mujoban_msgs_py.bags.metadata import qos_profile
 from mujoban_msgs_py.ros2.session import (
@@ -106,12 +108,16 @@ def record(options: argparse.Namespace) -> int:
             re.compile(options.regex)
     except re.error as error:
         raise CommandError(f"--regex '{options.regex}' is not a regular expression: {error}") from None
-    with Session(options, sim_time=options.use_sim_time) as session, BagWriter(path) as bag:
+    with (
+        StopSignal(deferred=False) as stop,
+        Session(options, sim_time=options.use_sim_time) as session,
+        BagWriter(path) as bag,
+    ):
         recorder = Recorder(session, bag, options)
-        try:
+        with suppress(KeyboardInterrupt):
             recorder.begin()
-            while True:
+            stop.deferred = True  # a message that is being written is written, and counted
+            while not stop.requested:
                 recorder.look()
                 session.spin_for(max(options.polling_interval, 1) / 1000)
-        except KeyboardInterrupt:
-            return 0
+    return 0

@@ -16,6 +16,7 @@ import pytest
 import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseArray
+from mcap.writer import Writer as McapWriter
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -231,6 +232,18 @@ def test_what_is_recorded_in_simulated_time_begins_with_the_clock(talker, tmp_pa
     bag = open_bag(tmp_path / "bag")
     assert bag.topics["/pose"].count > 5 and bag.topics["/episode"].count == 1
     assert bag.span == (1000 * 10**9, 1000 * 10**9)
+
+
+def test_a_signal_that_comes_while_a_message_is_written_leaves_a_whole_bag(talker, tmp_path, monkeypatch):
+    add = McapWriter.add_message
+
+    def add_and_be_interrupted(*what):
+        add(*what)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(McapWriter, "add_message", add_and_be_interrupted)
+    assert run(["bag", "record", "-o", str(tmp_path / "bag"), "/pose"]) == 0
+    assert open_bag(tmp_path / "bag").topics["/pose"].count > 0
 
 
 @pytest.fixture
