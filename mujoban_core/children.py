@@ -10,6 +10,7 @@ import subprocess
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from types import FrameType
 from typing import IO, Final
 
 _PARENT: Final = "MUJOBAN_PARENT"
@@ -82,6 +83,24 @@ def end_with_parent() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != int(pid):
         raise SystemExit(128 + signal.SIGTERM)
+
+
+def outlast(seconds: int) -> None:
+    """Have the first SIGTERM end this process after some seconds, unless its parent has ended; a second one, at once.
+
+    One that goes to a whole group of processes reaches this one together with its parent, which still takes what this
+    one makes until it has come to an end in order.
+    """
+    parent, asked = os.getppid(), False
+
+    def end(_: int, __: FrameType | None) -> None:
+        nonlocal asked
+        if asked or os.getppid() != parent:
+            os._exit(128 + signal.SIGTERM)
+        asked = True
+        signal.alarm(seconds)
+
+    signal.signal(signal.SIGTERM, end)
 
 
 def stop(children: Iterable[subprocess.Popen[bytes]], grace: float = GRACE) -> int:

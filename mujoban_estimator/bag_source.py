@@ -25,6 +25,8 @@ from mujoban_rl.engine import Source, State
 _T = TypeVar("_T")
 _AHEAD: Final = 2
 """Batches that are read ahead."""
+_LAST: Final = 10
+"""Seconds that a reading process goes on after a SIGTERM, in which the training ends its update and is saved."""
 
 
 @dataclass(frozen=True)
@@ -217,3 +219,4 @@ def _as_is(item: Any) -> Any:
 
 def _begin(_: int) -> None:
     children.end_with_parent()
+    children.outlast(_LAST)

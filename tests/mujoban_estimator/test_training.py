@@ -1,3 +1,4 @@
+import multiprocessing
 import shutil
 
 import numpy as np
@@ -420,6 +421,17 @@ def test_what_is_read_does_not_depend_on_how_many_processes_read(make, tmp_path)
         trainer.run(limit_updates=6)
     one, *others = ([p.numpy() for p in trainer.learner.estimator.state_dict().values()] for trainer in trainers)
     assert all(np.array_equal(a, b) for other in others for a, b in zip(one, other, strict=True))
+
+
+def test_a_signal_to_the_reading_process_as_well_leaves_the_training_time_to_end_in_order(make, tmp_path):
+    source = make(tmp_path, workers=1).source
+    source.next_batch()
+    (reader,) = multiprocessing.active_children()
+    reader.terminate()
+    for _ in range(4):  # more than are read ahead
+        assert source.next_batch().valid.any()
+    source.close()
+    assert not multiprocessing.active_children()
 
 
 def test_fewer_than_no_reading_processes_are_refused(make, tmp_path):
