@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.paper import bodies
-from benchmarks.paper.runs import ALL, ROOT, load
+from benchmarks.paper.runs import ALL, ROOT, distinct, load
 from bringup import model_card
 from bringup.model_card import Place, Score
 from mujoban_core.files import write_atomically
@@ -47,7 +47,7 @@ def _scores(digest: str | None) -> list[Score]:
             run.title, ", ".join(run.oracle) or "none", len(report["episodes"]), report["success_rate"],
             report["success_interval"],
         )
-        for run in {run.name: run for run in (*bodies.RUNS, *ALL)}.values()
+        for run in distinct((*bodies.RUNS, *ALL))
         if (report := load(run)) is not None and digest in report["weights"].values()
     ]
 

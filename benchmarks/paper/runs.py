@@ -8,7 +8,7 @@ Rebuilding tables and figures from the JSON takes seconds: `make results`.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -123,6 +123,11 @@ ALL: Final = (
 )  # fmt: skip
 
 
+def distinct(runs: Iterable[Run]) -> list[Run]:
+    """Return evaluations without those that come twice: one row of Table 2 is a point of Figure 5, too."""
+    return list({run.name: run for run in runs}.values())
+
+
 def load(run: Run) -> dict[str, Any] | None:
     """Return the evaluation's JSON, or None when it has not been run.
 
@@ -200,8 +205,7 @@ def rerun(options: Options) -> None:
     # Imported here: both need the definitions above.
     from benchmarks.paper import baselines, bodies, film, parts
 
-    # One row of Table 2 is a point of Figure 5, too.
-    every = {run.name: run for run in (*bodies.RUNS, *ALL, *baselines.RUNS)}.values()
+    every = distinct((*bodies.RUNS, *ALL, *baselines.RUNS))
     films = {kept.name: kept for kept in film.FILMS.values()}
     names = [*(run.name for run in every), *films]
     unknown = set(options.only) - set(names)
