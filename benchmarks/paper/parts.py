@@ -47,7 +47,7 @@ class Part:
     def start(self) -> subprocess.Popen[bytes]:
         """Measure it in a process of its own."""
         command = [sys.executable, "bringup/evaluate.py", *self.run.options(), "--seed", str(SEED + self.first)]
-        command += ["--episodes", str(self.episodes), "--batch", str(self.episodes), "--json", str(self.file)]
+        command += ["--episodes", str(self.episodes), "--json", str(self.file)]
         self.file.parent.mkdir(parents=True, exist_ok=True)
         with self.file.with_suffix(".log").open("wb") as log:
             return subprocess.Popen(command, cwd=ROOT, stderr=log, env={**os.environ, "OMP_NUM_THREADS": "1"})
