@@ -195,8 +195,8 @@ class Options:
     processes: int = 2
     """Evaluations of different levels that run at the same time."""
     part: int = 128
-    """Levels that one process plays; what is measured is kept when such a part has ended. At the end of each the last
-    robots of all play on alone, up to the time limit, which takes a fifth of the time of parts of 64."""
+    """Levels that one process plays; what is measured is kept when such a part has ended. At its end a few robots
+    play on alone up to the time limit: the last eight of 64 took a quarter of the part's time."""
     again: bool = False
     """Rerun also what has been measured with the weights that ship now."""
 
