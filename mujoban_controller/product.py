@@ -66,9 +66,13 @@ class ProductLearner(Learner[BatchT]):
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         self.restore_own(state.part("own"))
-        best = state.part("best")
-        self._best_weights = best.tensors
-        self._best_score = None if best.values["score"] is None else tuple(best.values["score"])
+        self.restore_best(state.part("best"))
+
+    def restore_best(self, state: State) -> None:
+        """Take over the best product and its score."""
+        score = state.values["score"]
+        self._best_weights = state.tensors
+        self._best_score = None if score is None else tuple(score)
 
     def evaluate(self) -> Scalars:
         """Return how many validation levels the product solves under a solver's plans; keep it if it is the best."""

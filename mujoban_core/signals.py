@@ -159,6 +159,16 @@ class StopSignal:
             raise Interrupted(self.number)
 
     @contextmanager
+    def immediate(self) -> Iterator[None]:
+        """Have a signal raise `Interrupted` at once inside, also one that came before: work that may be given up."""
+        self.deferred = False
+        try:
+            self.check()
+            yield
+        finally:
+            self.deferred = True
+
+    @contextmanager
     def waking(self, wake: Callable[[], None]) -> Iterator[None]:
         """Call `wake` as soon as a signal comes, from another thread: for work that waits outside of Python.
 

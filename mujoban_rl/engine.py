@@ -26,7 +26,7 @@ from torch.optim import Optimizer
 
 from mujoban_core import children
 from mujoban_core.program import say
-from mujoban_core.signals import StopSignal
+from mujoban_core.signals import Interrupted, StopSignal
 from mujoban_core.text import readable
 from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.memory import keep_freed_memory
@@ -104,8 +104,14 @@ class Learner(_Part, Generic[BatchT]):
         return {}
 
     def evaluate(self) -> Scalars:
-        """Return how good the product is on validation levels; must leave all states as they are."""
+        """Return how good the product is on validation levels; must leave all states as they are.
+
+        A signal cuts it short; then it is done again when the run goes on.
+        """
         return {}
+
+    def restore_best(self, state: State) -> None:
+        """Take over the part `best` of what `state` returned: all that a light copy keeps of it."""
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the weights that the run is for, with their record, into the run's directory."""
@@ -147,8 +153,9 @@ class Cadence:
     evaluate_samples: float = math.inf
     """Samples between evaluations; the end of a bit of the run is evaluated too, unless a signal asks to stop."""
     evaluate_seconds: float = math.inf
-    """Wall-clock seconds between evaluations."""
+    """Wall-clock seconds between evaluations; 0: after every update."""
     save_seconds: float = 120.0
+    """Wall-clock seconds between checkpoints, likewise."""
     evaluate_first: bool = False
     """Evaluate also what the run begins with."""
 
@@ -161,9 +168,12 @@ class Cadence:
         ):
             if not count > 0:
                 raise ValueError(f"{verb} every {count} {unit}: expected a positive number")
+        for verb, seconds in (("evaluate", self.evaluate_seconds), ("save", self.save_seconds)):
+            if not seconds >= 0:
+                raise ValueError(f"{verb} every {seconds} seconds: expected a number of 0 or more")
 
 
-CARRIED: Final = ("progress", "metrics", "skipped")
+CARRIED: Final = ("progress", "metrics", "skipped", "due", "learner.best")
 """What a light copy of a checkpoint holds beside its modules (see `mujoban_rl.run_directory.copy_light`)."""
 
 
@@ -203,6 +213,8 @@ class Trainer(Generic[BatchT]):
         self._published: dict[str, Tensor] | None = None
         self._version = 0
         self._evaluated: int | None = None
+        self._due = self.cadence.evaluate_first
+        """Whether the run begins with an evaluation: one that was asked for, or that a signal cut short."""
         self._restore()
 
     @property
@@ -242,7 +254,7 @@ class Trainer(Generic[BatchT]):
             ):
                 spent = self._loop(log, stop, limits)
                 if not stop.requested and self._evaluated != self.progress.updates:
-                    self._evaluate(log)
+                    self._evaluate(log, stop)
                 self.save()
             if stop.requested:
                 done = f"{readable(self.progress.samples)} samples"
@@ -258,8 +270,9 @@ class Trainer(Generic[BatchT]):
         cadence, progress, source = self.cadence, self.progress, self.source
         clock, meter = Clock(progress, source.worker_cpu_seconds), Meter()
         saved = evaluated = limits.time.elapsed
-        if cadence.evaluate_first and not progress.updates:
-            self._evaluate(log)
+        if self._due:
+            self._evaluate(log, stop)
+            clock.skip()
         spent = True
         if not self.complete:
             self._publish(again=True)
@@ -281,7 +294,7 @@ class Trainer(Generic[BatchT]):
                 self._log(log, meter)
             due = progress.samples // cadence.evaluate_samples > before // cadence.evaluate_samples
             if due or limits.time.elapsed - evaluated > cadence.evaluate_seconds:
-                self._evaluate(log)
+                self._evaluate(log, stop)
                 clock.skip()
                 evaluated = limits.time.elapsed
             if limits.time.elapsed - saved > cadence.save_seconds:
@@ -302,16 +315,23 @@ class Trainer(Generic[BatchT]):
             self._version = self.progress.updates
         self.source.publish(self._published, self._version)
 
-    def _evaluate(self, log: TrainingLog) -> None:
-        self._evaluated = self.progress.updates
+    def _evaluate(self, log: TrainingLog, stop: StopSignal) -> None:
+        self._due = True
+        try:
+            # Judging whole levels may take minutes, more than whoever stops a run waits before it is killed.
+            with stop.immediate():
+                scores = self.learner.evaluate()
+        except Interrupted:
+            return
+        self._due, self._evaluated = False, self.progress.updates
         # A rate of nothing is not a number, which JSON does not know.
-        self.metrics = {k: float(v) for k, v in self.learner.evaluate().items() if math.isfinite(v)}
+        self.metrics = {k: float(v) for k, v in scores.items() if math.isfinite(v)}
         if not self.metrics:
             return
         shown = ", ".join(f"{k} {readable(v)}" for k, v in self.metrics.items())
         line = f"{self.progress.samples:,} samples, {self.progress.cpu_seconds:,.0f} CPU s: {shown}"
-        scores = {f"evaluation/{k}": v for k, v in self.metrics.items()}
-        log.scalars(self.progress.samples, scores | self._spent(), line)
+        logged = {f"evaluation/{k}": v for k, v in self.metrics.items()}
+        log.scalars(self.progress.samples, logged | self._spent(), line)
 
     def _spent(self) -> dict[str, float]:
         progress = self.progress
@@ -335,6 +355,7 @@ class Trainer(Generic[BatchT]):
                 "progress": vars(self.progress),
                 "metrics": self.metrics,
                 "skipped": self._guard.skipped,
+                "due": self._due,
                 "began": self.source.began,
                 **state.values,
             },
@@ -355,8 +376,12 @@ class Trainer(Generic[BatchT]):
             self.progress = Progress(**snapshot.extra["progress"])
             self.metrics = snapshot.extra["metrics"]
             self._guard.skipped = snapshot.extra["skipped"]
-            if not snapshot.light:
-                state = State(snapshot.extra, snapshot.tensors)
+            self._due = snapshot.extra.get("due", False)
+            state = State(snapshot.extra, snapshot.tensors)
+            if snapshot.light:
+                if "best" in snapshot.extra.get("learner", {}):
+                    self.learner.restore_best(state.part("learner").part("best"))
+            else:
                 for name, part in parts.items():
                     part.restore(state.part(name))
                 published = state.part("published")

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -38,7 +38,7 @@ class Snapshot:
     tensors: dict[str, Tensor]
     """Loose tensors, such as `torch.Generator` states."""
     light: bool = False
-    """Whether it holds modules and `extra` alone (see `copy_light`)."""
+    """Whether it holds modules and parts of `extra` and `tensors` alone (see `copy_light`)."""
 
 
 class RunDirectory:
@@ -178,8 +178,8 @@ class RunDirectory:
         return _newest_first(self.path)
 
 
-def copy_light(run: Path, out: Path, extra: Collection[str]) -> Path | None:
-    """Write a light copy of a run's newest intact checkpoint: its modules, matrices at half precision, some of `extra`.
+def copy_light(run: Path, out: Path, parts: Collection[str]) -> Path | None:
+    """Write a light copy of a run's newest intact checkpoint: modules, parts of the rest; matrices at half precision.
 
     A run that goes on from it begins anew with its optimisers and with all that it has gathered, which may be a
     thousand times as large: to carry a run elsewhere, not to go on as one that never stopped.
@@ -187,7 +187,7 @@ def copy_light(run: Path, out: Path, extra: Collection[str]) -> Path | None:
     Args:
         run: Directory of the run.
         out: Directory that gets the copy and the run's configuration; it is made if it does not exist.
-        extra: Names of the values to keep.
+        parts: Names of the values and tensors to keep, those of parts of a part with a dot; it may lack some.
 
     Returns:
         Path of its safetensors file; None if the run has no checkpoint.
@@ -198,16 +198,27 @@ def copy_light(run: Path, out: Path, extra: Collection[str]) -> Path | None:
     if (found := _newest_intact(run)) is None:
         return None
     path, content, flat = found
-    modules = {k: _halved(v) for k, v in flat.items() if k.startswith("module/")}
-    check_finite(modules, f"light copy of {path}")
-    kept = {name: content["extra"][name] for name in extra}
+    prefixes = ("module/", *(f"tensor/{name}." for name in parts))
+    tensors = {k: _halved(v) for k, v in flat.items() if k.startswith(prefixes)}
+    check_finite(tensors, f"light copy of {path}")
+    kept: dict[str, Any] = {}
+    for name in parts:
+        kept = _overlaid(kept, _path_to(content["extra"], name.split(".")))
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / _CONFIG, (run / _CONFIG).read_bytes())
     target = out / path.name
-    _save(modules, target)
+    _save(tensors, target)
     light = {"step": content["step"], "light": True, "extra": kept, "digest": digest(target)}
     write_atomically(target.with_suffix(".json"), json.dumps(light).encode())
     return target
+
+
+def _path_to(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return nested mappings with nothing in them but the value under nested names; empty where that is missing."""
+    first, *rest = names
+    if first not in values:
+        return {}
+    return {first: _path_to(values[first], rest) if rest else values[first]}
 
 
 def _halved(values: Tensor) -> Tensor:
@@ -282,7 +293,7 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | N
     try:
         content = json.loads(path.with_suffix(".json").read_text())
         return (content, load_file(path)) if digest(path) == content["digest"] else None
-    except (OSError, json.JSONDecodeError, KeyError, SafetensorError):
+    except (OSError, ValueError, TypeError, KeyError, SafetensorError):
         return None
 
 

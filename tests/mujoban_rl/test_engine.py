@@ -117,6 +117,35 @@ def test_a_run_interrupted_by_a_signal_and_resumed_equals_one_that_never_stopped
     assert whole.metrics == second.metrics
 
 
+def test_a_signal_cuts_an_evaluation_short_which_comes_first_when_the_run_goes_on(tmp_path):
+    def judged(run):
+        judge = run.learner.evaluate
+        run.learner.evaluate = lambda: (evaluated.append(run.progress.updates), judge())[1]
+        return run
+
+    evaluated, finished = [], []
+    whole = judged(trainer(tmp_path / "whole"))
+    assert whole.run()
+    expected, evaluated = evaluated, []
+    first = judged(trainer(tmp_path / "parts"))
+    judge = first.learner.evaluate
+
+    def interrupted():
+        scores = judge()
+        if first.progress.updates == expected[1]:
+            os.kill(os.getpid(), signal.SIGTERM)
+            finished.append("an evaluation that was to be cut short")
+        return scores
+
+    first.learner.evaluate = interrupted
+    with pytest.raises(Interrupted):
+        first.run()
+    assert not finished and first.metrics != {} and first.progress.updates == expected[1]
+    second = judged(trainer(tmp_path / "parts"))
+    assert second.run() and evaluated == [*expected[:2], *expected[1:]]
+    assert same(weights(whole), weights(second)) and whole.metrics == second.metrics
+
+
 def test_a_killed_learner_goes_on_from_its_last_checkpoint_as_if_nothing_had_happened(tmp_path):
     def learn():
         kill = Noise(on_batch=lambda n: os.kill(os.getpid(), signal.SIGKILL) if n == 17 else None)
@@ -230,6 +259,17 @@ def test_a_budget_that_is_no_amount_is_refused():
         Budget(samples=0)
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("log_updates", 0), ("publish_updates", -1), ("evaluate_samples", math.nan), ("evaluate_seconds", -1.0),
+     ("save_seconds", math.nan)],
+)  # fmt: skip
+def test_a_cadence_that_is_no_distance_is_refused(option, value):
+    verb, unit = option.split("_")
+    with pytest.raises(ValueError, match=f"{verb} every {value} {unit}: expected a (positive )?number"):
+        Cadence(**{option: value})
+
+
 def test_a_run_goes_on_elsewhere_from_a_light_copy_with_its_networks_and_what_it_has_spent(tmp_path):
     here = trainer(tmp_path / "here")
     here.run(limit_samples=120)
@@ -240,6 +280,27 @@ def test_a_run_goes_on_elsewhere_from_a_light_copy_with_its_networks_and_what_it
         torch.testing.assert_close(weights(there)[name], tensor, rtol=1e-3, atol=1e-6)
     assert not there.learner.adam.state and there.source.batches == 0
     assert there.run() and there.progress.samples == 200
+
+
+def test_a_light_copy_keeps_the_best_product_so_far(tmp_path):
+    class Keeping(Regression):
+        best = torch.zeros(1)
+
+        def state(self):
+            return State.of({"own": super().state(), "best": State({"score": 0.5}, {"weight": self.best})})
+
+        def restore_best(self, state):
+            self.best, self.score = state.tensors["weight"], state.values["score"]
+
+    def run(name):
+        return Trainer(RunDirectory(tmp_path / name, {}), Keeping(), Noise(), Budget(samples=200), CADENCE)
+
+    here = run("here")
+    here.learner.best = torch.ones(1)
+    here.run(limit_samples=40)
+    copy_light(tmp_path / "here", tmp_path / "there", CARRIED)
+    there = run("there")
+    assert there.learner.best == 1.0 and there.learner.score == 0.5
 
 
 def test_a_light_copy_of_what_is_not_intact_is_refused(tmp_path):

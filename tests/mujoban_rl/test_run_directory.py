@@ -136,11 +136,12 @@ def test_moments_come_back_in_the_layout_of_their_parameters_which_fused_optimis
     assert torch.equal(net.weight, again.weight)
 
 
-def test_damaged_newest_checkpoint_falls_back_to_the_one_before(tmp_path):
+@pytest.mark.parametrize(("half", "content"), [("safetensors", b"broken"), ("json", b"\xff\xfe"), ("json", b"[]")])
+def test_damaged_newest_checkpoint_falls_back_to_the_one_before(tmp_path, half, content):
     net, _adam = _make()
     run = RunDirectory(tmp_path, {})
     run.save(1, modules={"net": net})
-    run.save(2, modules={"net": net}).write_bytes(b"broken")
+    run.save(2, modules={"net": net}).with_suffix(f".{half}").write_bytes(content)
     snapshot = run.load(modules={"net": Net()})
     assert snapshot is not None and snapshot.step == 1
     (tmp_path / "checkpoint-0000000001.json").unlink()
@@ -173,6 +174,17 @@ def test_a_light_copy_halves_matrices_and_keeps_counts_as_they_are(tmp_path):
     assert load_file(copy)["module/net/layer.weight"].dtype == torch.float16
     assert nets[1].count == 1e6
     torch.testing.assert_close(nets[1].layer.weight, nets[0].layer.weight, rtol=1e-3, atol=1e-6)
+
+
+def test_a_light_copy_keeps_parts_of_parts(tmp_path):
+    RunDirectory(tmp_path / "run", {}).save(
+        3, modules={}, extra={"learner": {"best": {"score": 1.0}, "own": {}}, "source": {}},
+        tensors={"learner.best.w": torch.ones(2), "learner.own.w": torch.ones(1)},
+    )  # fmt: skip
+    copy_light(tmp_path / "run", tmp_path / "copy", ["learner.best", "learner.none", "due"])
+    snapshot = RunDirectory(tmp_path / "copy", {}).load(modules={})
+    assert snapshot is not None and snapshot.extra == {"learner": {"best": {"score": 1.0}}}
+    assert list(snapshot.tensors) == ["learner.best.w"]
 
 
 def test_run_directory_refuses_another_configuration_once_something_was_done(tmp_path):
