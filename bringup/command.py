@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mujoban_core.bodies import BALL, Body, get_body
+from mujoban_core.bodies import BALL, get_body
 from mujoban_core.look_around import look_around
 from mujoban_core.plugins import (
     AGENT,
@@ -24,6 +24,7 @@ from mujoban_core.plugins import (
     SCOUT,
     SCRIPTED,
     check_body,
+    chosen_weights,
     load_module,
     load_scout,
     shipped_weights,
@@ -53,10 +54,7 @@ class Choice:
 
     def of(self, body: str) -> Choice:
         """Return the same with the weights that ship for a body, where it takes those that ship."""
-        if self.source != LEARNED or self.weights is not None:
-            return self
-        own = shipped_weights(self.role, body)
-        return self if own == shipped_weights(self.role) else replace(self, weights=own)
+        return replace(self, weights=chosen_weights(self.role, self.source, self.weights, body))
 
     def load(self, device: str = "cpu") -> Module:
         """Return the module.
@@ -118,14 +116,11 @@ class Stack:
         if self.look_around is not None:
             return self.look_around
         body = get_body(self.body)
-        return body.look_ticks if self.choices["estimator"].source != ORACLE or self._seeks_heading(body) else 0
-
-    def _seeks_heading(self, body: Body) -> bool:
-        """Return whether the controller finds its heading by sight."""
-        if body.heading_index is not None:
-            return False
+        if self.choices["estimator"].source != ORACLE:
+            return body.look_ticks
         controller = self.choices["controller"]
-        return controller.source != ORACLE and not controller.load().privileged
+        seeing = controller.source != ORACLE and body.seeking_ticks and not controller.load().privileged
+        return body.seeking_ticks if seeing else 0
 
     def policy(self) -> SensePlanAct:
         """Return the modules composed into one policy.

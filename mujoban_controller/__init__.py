@@ -9,7 +9,14 @@ if TYPE_CHECKING:
     from mujoban_core.interfaces import Controller
 
 _WEIGHTS = Path(__file__).parent / "weights"
-SHIPPED = _WEIGHTS / "controller_ball.safetensors"
+
+
+def camera_weights(body: str) -> Path:
+    """Return where the weights of a body's camera policy are."""
+    return _WEIGHTS / f"controller_{body}.safetensors"
+
+
+SHIPPED = camera_weights("ball")
 """Weights that ship with the package."""
 
 

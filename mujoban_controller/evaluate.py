@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from mujoban_controller import SHIPPED, teacher_weights
+from mujoban_controller import camera_weights, teacher_weights
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.drivers import Driver
 from mujoban_controller.judge import judge
@@ -79,7 +79,7 @@ def make_driver(options: Options) -> tuple[Driver, str]:
         return scripted_driver, "scripted"
     teacher = options.driver == "teacher"
     cls = PrivilegedPolicy if teacher else VisuomotorController
-    weights = options.weights or (teacher_weights(options.body) if teacher else SHIPPED)
+    weights = options.weights or (teacher_weights if teacher else camera_weights)(options.body)
     policy = load_weights(cls, weights, options.device, body=options.body)
     return policy.driver(), digest(weights)
 

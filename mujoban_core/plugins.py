@@ -130,6 +130,17 @@ def shipped_weights(role: str, body: str | None = None) -> Path:
     return own if own.is_file() else path
 
 
+def chosen_weights(role: str, source: str, weights: Path | None, body: str) -> Path | None:
+    """Return which weights a module of a body loads: those given, or those that ship for the body alone, or None.
+
+    None leaves those that ship for the default body, or a module that has no weights.
+    """
+    if weights is not None or source != LEARNED:
+        return weights
+    own = shipped_weights(role, body)
+    return None if own == shipped_weights(role) else own
+
+
 def _interface(role: str) -> type[Module]:
     interfaces: dict[str, type[Module]] = {**ROLES, AGENT: Agent}
     try:

@@ -14,16 +14,16 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 from benchmarks.paper.figures import margins, save_rates
-from benchmarks.paper.runs import CONFIGURATIONS, ROOT, SENSE, Run, load
+from benchmarks.paper.runs import CONFIGURATIONS, SENSE, Run, load
+from mujoban_controller import camera_weights, teacher_weights
 from mujoban_core.bodies import ANT, BALL
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import shipped_weights
 from mujoban_sim.presets import REFERENCE
 
-_PAPER: Final = {BALL.name: 0.818, ANT.name: 0.737}
-"""Success at difficulty 5 (paper A.3)."""
-_WEIGHTS: Final = ROOT / "mujoban_controller" / "weights"
 _GIVEN_SENSE: Final = CONFIGURATIONS[1]
+_PAPER: Final = {BALL.name: _GIVEN_SENSE.paper_success, ANT.name: 0.737}
+"""Success at difficulty 5 (paper A.3)."""
 
 
 class Driven(NamedTuple):
@@ -37,10 +37,10 @@ class Driven(NamedTuple):
 
 
 DRIVEN: Final = (
-    Driven("ball", BALL.name, "ball, by its camera", _WEIGHTS / "controller_ball.safetensors", "tab:blue"),
-    Driven("ant_camera", ANT.name, "ant, by its camera", _WEIGHTS / "controller_ant.safetensors", "tab:orange"),
+    Driven("ball", BALL.name, "ball, by its camera", camera_weights(BALL.name), "tab:blue"),
+    Driven("ant_camera", ANT.name, "ant, by its camera", camera_weights(ANT.name), "tab:orange"),
     Driven(
-        "ant", ANT.name, "ant, by ground truth (privileged)", _WEIGHTS / "teacher_ant.safetensors", "tab:green"
+        "ant", ANT.name, "ant, by ground truth (privileged)", teacher_weights(ANT.name), "tab:green"
     ),
 )  # fmt: skip
 """All learned in the reference world, in which they are compared."""

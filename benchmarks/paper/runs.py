@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -96,12 +96,10 @@ CONFIGURATIONS: Final = (
 ALONE: Final = ("--look-ahead", "0")
 """The planner's policy without its search."""
 POLICY_ALONE: Final = (
-    Run(
-        "default_alone", "default, the planner's policy alone", further=ALONE, paper_success=0.787, paper_reward=11.42
-    ),
-    Run(
-        "planner_controller_alone", "planner + controller only, the policy alone", oracle=SENSE, further=ALONE,
-        paper_success=0.818, paper_reward=11.83,
+    replace(CONFIGURATIONS[0], name="default_alone", title="default, the planner's policy alone", further=ALONE),
+    replace(
+        CONFIGURATIONS[1], name="planner_controller_alone", title="planner + controller only, the policy alone",
+        further=ALONE,
     ),
 )  # fmt: skip
 """Without the search ahead, which the paper's planner does not have either, beside rows of Table 2."""

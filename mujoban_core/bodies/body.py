@@ -214,6 +214,11 @@ class Body:
         """Where the heading stands in proprioception; None for a free root, which does not feel it."""
         return self.proprio.joint_position.start + self.joint_qpos.index(3) if self.root == "slides" else None
 
+    @property
+    def seeking_ticks(self) -> int:
+        """Ticks of the look with which who has to find the heading by sight begins; 0 where it is felt."""
+        return self.look_ticks if self.heading_index is None else 0
+
     @cached_property
     def mirrored_actuators(self) -> Relabelling:
         """Actuators after the reflection that `mirror` tells of joints."""

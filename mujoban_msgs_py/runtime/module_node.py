@@ -17,7 +17,7 @@ from rclpy.serialization import serialize_message
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.interfaces import GroundTruth, Module, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
-from mujoban_core.plugins import LEARNED, PRIVILEGED, check_body, load_module
+from mujoban_core.plugins import LEARNED, PRIVILEGED, check_body, chosen_weights, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
@@ -50,9 +50,10 @@ class ModuleNode(TickNode, Generic[ModuleT]):
 
     Parameters:
         module: "learned", "oracle" or `package.module:Class`; fixed when the node starts.
-        weights: Weights file of the learned module; empty means those that ship. Setting it while the node
-            runs loads them, and the module's memory restarts with the next tick. Weights that cannot be loaded
-            are refused, and the old ones stay; so are those that need the ground truth where the node began without.
+        weights: Weights file of the learned module; empty means those that ship, for the body if there are. Setting
+            it while the node runs loads them, and the module's memory restarts with the next tick. Weights that cannot
+            be loaded are refused, and the old ones stay; so are those that need the ground truth where the node began
+            without.
         body: The robot's body, of which the weights have to be; empty means any. Fixed when the node starts.
         device: Device of the learned module; setting it loads the weights again.
         threads: Threads of PyTorch in this process; at batch 1 further ones gain little on an idle machine, and on a
@@ -155,7 +156,10 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         self.take_up(stamp, [Output(self._publisher, answer)] if answer else ())
 
     def _load(self, weights: str, device: str) -> ModuleT:
-        module = load_module(self.role, self._source, Path(weights) if weights else None, device)
+        path = Path(weights) if weights else None
+        if self._body:
+            path = chosen_weights(self.role, self._source, path, self._body)
+        module = load_module(self.role, self._source, path, device)
         if self._body:
             check_body(self.role, module, self._body)
         # `load_module` has checked that it is of the role.

@@ -13,6 +13,7 @@ from bringup.command import Choice, Stack
 from bringup.graph_recorder import RecorderNode
 from bringup.parameters import graph_parameters, write_parameters
 from mujoban_controller import teacher_weights
+from mujoban_controller.node import ControllerNode
 from mujoban_planner.deliberation import Deliberation
 from mujoban_sim.node import PARAMETERS, SimulatorNode
 from mujoban_sokoban.episodes import Episodes
@@ -66,6 +67,14 @@ def test_weights_of_another_body_are_refused_by_a_node_when_it_starts_and_while_
     command = [sys.executable, "-m", "mujoban_controller.node", "--ros-args", "--params-file", tmp_path / "ant.yaml"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (2, f"error: {why}\n")
+
+
+def test_a_node_that_is_told_a_body_alone_takes_the_weights_that_ship_for_it(ros):
+    node = ControllerNode(parameter_overrides=[Parameter("body", value="ant")])
+    try:
+        assert node.module.config["body"] == "ant"
+    finally:
+        node.destroy_node()
 
 
 @pytest.mark.parametrize(("speed", "seconds"), [(0.0, 0.0), (1.0, 0.01), (4.0, 0.0025)])

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from mujoban_controller import camera_weights
 from mujoban_controller.controller import Sight, VisuomotorController
+from mujoban_controller.evaluate import Options, make_driver
 from mujoban_core.bodies import BALL, INERTIAL_SIZE
+from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import ControllerInput
 from mujoban_rl.networks import rows_of_sky
@@ -152,3 +155,8 @@ def test_weights_survive_a_round_trip_and_damage_is_noticed(controller, tmp_path
 def test_unknown_bodies_are_refused():
     with pytest.raises(ValueError, match="unknown body 'car'"):
         VisuomotorController(body="car")
+
+
+def test_an_evaluation_drives_a_body_with_the_weights_that_ship_for_it():
+    _, identity = make_driver(Options(body="ant"))
+    assert identity == digest(camera_weights("ant"))
