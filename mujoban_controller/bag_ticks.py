@@ -31,7 +31,7 @@ from mujoban_core.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMI
 from mujoban_core.interfaces import renew_rows
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
-from mujoban_msgs_py.bags.training import episodes, find_bags, open_training_bag
+from mujoban_msgs_py.bags.training import episodes, find_bags, open_training_bag, require_about
 from mujoban_rl.engine import State
 from mujoban_rl.recordings import EndlessEpisodes
 from mujoban_sim.goals import GoalTracker
@@ -163,8 +163,8 @@ class BagTicks(Iterator[Fields]):
         self._config, self._policy, self._teacher = config, policy, teacher
         bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
         for bag in bags:
-            _check_about(bag, config)
-        self._episodes = EndlessEpisodes(bags, self._read, rng, rows)
+            require_about(bag, {"body": config.body, "world": config.world}, "--task.{}")
+        self._episodes = EndlessEpisodes(bags, self._read, rng, rows, lambda bag: bag.path.name)
         self._memory = Recurrent(*policy.initial_memory(rows))
 
     def _read(self, bag: Bag) -> Iterator[Fields]:
@@ -205,13 +205,6 @@ class BagTicks(Iterator[Fields]):
         self._episodes.restore(state.part("episodes"))
         tensors = state.part("memory").tensors
         self._memory = Recurrent(*(tensors[name].to(self._policy.device) for name in MEMORY_FIELDS))
-
-
-def _check_about(bag: Bag, config: GoalTaskConfig) -> None:
-    """Refuse a bag that names another body or world: weights are of one of each."""
-    for what, expected in (("body", config.body), ("world", config.world)):
-        if (found := bag.about.get(what, expected)) != expected:
-            raise BagError(f"{bag.path}: recorded with the {what} {found}, expected {expected} (--task.{what})")
 
 
 class BagPlayer(Player):

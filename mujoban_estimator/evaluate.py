@@ -33,7 +33,7 @@ from mujoban_estimator.estimator import Belief, StateEstimator, probabilities
 from mujoban_estimator.metrics import MapScores, TerminationScores
 from mujoban_estimator.odometry import Track
 from mujoban_estimator.termination import ControlTermination
-from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
+from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag, require_about
 
 PROG = "mujoban_estimator.evaluate"
 
@@ -61,10 +61,11 @@ def evaluate(
         skip_damaged: leave out damaged parts of bags.
 
     Raises:
-        mujoban_msgs_py.bags.BagError: if a bag cannot be read.
+        mujoban_msgs_py.bags.BagError: if a bag cannot be read or is of another body.
     """
     report = ReadReport()
-    streams = [_chain(bags[i::_STREAMS], report, skip_damaged) for i in range(min(_STREAMS, len(bags)))]
+    body = estimator.body.name
+    streams = [_chain(bags[i::_STREAMS], body, report, skip_damaged) for i in range(min(_STREAMS, len(bags)))]
     score = _Scoring(estimator, termination, len(streams))
     for batch in Batcher(streams, _LENGTH, estimator.body):
         score.add(batch)
@@ -73,9 +74,10 @@ def evaluate(
     return {**score.maps.report(), **score.ends.report(), "ticks": float(report.ticks)}
 
 
-def _chain(bags: Sequence[Path], report: ReadReport, skip_damaged: bool) -> Iterator[Stretch]:
+def _chain(bags: Sequence[Path], body: str, report: ReadReport, skip_damaged: bool) -> Iterator[Stretch]:
     for path in bags:
         bag = open_training_bag(path, TOPICS, skip_damaged=skip_damaged)
+        require_about(bag, {"body": body}, "the {} of the weights")
         yield from stretches(bag, _LENGTH, report, allow_test_seeds=True)
 
 

@@ -32,7 +32,7 @@ from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, step_if_finite, warm_up_linear
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import WeightsError, load_weights, save_weights
+from mujoban_rl.weights import WeightsError, load_weights, save_weights, usable_device
 
 _PLACE_OFF: Final = 0.02
 """Standard deviation of what needles of the place are off in use, in cells."""
@@ -152,10 +152,10 @@ class EstimatorLearner(Learner[Batch]):
             config: Settings; the seed decides weights and every draw.
             device: Where the modules learn.
             validation: Bags to evaluate on; none: no evaluation.
-            out: Folder that receives the weights of both modules, if any.
+            out: Folder that receives the weights of both modules; None: `weights` in the run's directory.
         """
         self.training, self.config = config, config.learner
-        self.device = torch.device(device)
+        self.device = usable_device(device)
         self.rng = np.random.default_rng(config.seed)
         torch.manual_seed(config.seed)  # the initial weights
         self.estimator = StateEstimator(**vars(self.config.estimator)).to(self.device)
@@ -231,11 +231,10 @@ class EstimatorLearner(Learner[Batch]):
         return evaluate(self.estimator, self.termination, self._validation) if self._validation else {}
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the weights of both modules where they are asked for."""
-        if self._out is None:
-            return
+        """Write the weights of both modules."""
+        out = self._out or directory.path / "weights"
         for name, module in (("estimator", self.estimator), ("termination", self.termination)):
-            save_weights(self._out / f"{name}.safetensors", module, module.hyperparameters(), record)
+            save_weights(out / f"{name}.safetensors", module, module.hyperparameters(), record)
 
     def _lost_track(self, streams: int) -> Track:
         """Return tracks at the start of episodes whose odometers are off."""

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from mujoban_core.bodies import get_body
 from mujoban_core.grid import INSTRUCTION_LIMIT
-from mujoban_core.interfaces import Memory, Termination, TerminationInput
+from mujoban_core.interfaces import Memory, Termination, TerminationInput, check_termination
 from mujoban_core.ranges import check_counts
 from mujoban_estimator.bearings import BEARINGS, Bearings, Progress, follow
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
@@ -48,9 +48,8 @@ class TerminationConfig:
 
     def __post_init__(self) -> None:
         """Reject what is out of range."""
-        check_counts(self, "stem", "channels", "blocks", "camera", "hidden", "limit")
-        if not 0.0 < self.threshold < 1.0:
-            raise ValueError(f"threshold is {self.threshold}: expected a number between 0 and 1")
+        check_counts(self, "stem", "channels", "blocks", "camera", "hidden")
+        check_termination(limit=self.limit, threshold=self.threshold)
 
 
 class TerminationMemory(NamedTuple):

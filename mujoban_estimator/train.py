@@ -26,7 +26,13 @@ from mujoban_estimator.bag_source import BagSource, Reading
 from mujoban_estimator.bag_stream import TOPICS
 from mujoban_estimator.data import Batch
 from mujoban_estimator.learner import EstimatorLearner, TrainConfig
-from mujoban_msgs_py.bags.training import bags_digest, find_bags, open_training_bag, require_training_seeds
+from mujoban_msgs_py.bags.training import (
+    bags_digest,
+    find_bags,
+    open_training_bag,
+    require_about,
+    require_training_seeds,
+)
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import provenance
@@ -45,7 +51,7 @@ class Options:
     validation: tuple[Path, ...] = ()
     """Bags to evaluate on; none: no evaluation."""
     out: Path | None = None
-    """Folder that receives estimator.safetensors and termination.safetensors."""
+    """Folder that receives estimator.safetensors and termination.safetensors; `weights` in the run's by default."""
     start: Path | None = None
     """Folder with weights of both modules to start a new run from."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
@@ -79,6 +85,7 @@ def make_trainer(options: Options) -> Trainer[Batch]:
         bag = open_training_bag(path, TOPICS, skip_damaged=options.skip_damaged)
         if path in bags and not options.allow_test_seeds:
             require_training_seeds(bag)
+        require_about(bag, {"body": config.learner.estimator.body}, "--learner.estimator.{}")
         worlds.add(bag.about.get("world", "not stated"))
     learner = EstimatorLearner(config, device=options.device, validation=validation, out=options.out)
     if options.start is not None:

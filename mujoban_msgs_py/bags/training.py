@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -92,6 +92,22 @@ def require_training_seeds(bag: Bag) -> None:
     for value in bag.read([topics.TRUE_EPISODE.name]):
         _require_training_level(bag, value.value)
         return
+
+
+def require_about(bag: Bag, expected: Mapping[str, str], source: str) -> None:
+    """Refuse a bag whose recorder names another body or world: weights are of one of each.
+
+    Args:
+        bag: The bag; what it does not tell of itself is taken for what is expected.
+        expected: By name, `body` or `world`.
+        source: What has said what to expect, with `{}` for the name.
+
+    Raises:
+        BagError: If it names another one.
+    """
+    for what, wanted in expected.items():
+        if (found := bag.about.get(what, wanted)) != wanted:
+            raise BagError(f"{bag.path}: recorded with the {what} {found}, expected {wanted} ({source.format(what)})")
 
 
 def _require_training_level(bag: Bag, episode: EpisodeTruthReading) -> None:

@@ -21,6 +21,7 @@ from mujoban_estimator import load, load_termination
 from mujoban_estimator.bag_stream import TOPICS, BagStream, KeptBags, stretches
 from mujoban_estimator.data import Batch, Batcher, Stretch, choose_windows
 from mujoban_estimator.estimator import EstimatorConfig
+from mujoban_estimator.evaluate import evaluate
 from mujoban_estimator.learner import EstimatorLearner, LearnerConfig, TrainConfig
 from mujoban_estimator.termination import TerminationConfig
 from mujoban_estimator.train import Options, main, make_trainer
@@ -365,6 +366,27 @@ def test_the_command_names_a_bad_bag_in_one_line(tmp_path, capsys):
     assert exit_status("train", lambda: main(command)) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "no bag in" in said
+
+
+def test_bags_of_another_body_are_named_before_anything_is_learned_or_evaluated(bags, tmp_path):
+    ant = EstimatorConfig(body="ant"), TerminationConfig(body="ant")
+    options = Options((bags,), tmp_path, config=TrainConfig(LearnerConfig(*ant)))
+    told = r"bags.*: recorded with the body ball, expected ant"
+    with pytest.raises(BagError, match=rf"{told} \(--learner\.estimator\.body\)"):
+        make_trainer(options)
+    learner = EstimatorLearner(options.config)
+    with pytest.raises(BagError, match=rf"{told} \(the body of the weights\)"):
+        evaluate(learner.estimator, learner.termination, find_bags([bags]))
+
+
+def test_a_device_that_is_not_there_is_named(bags, tmp_path):
+    with pytest.raises(WeightsError, match="device 'tpu': expected cpu or cuda"):
+        make_trainer(Options((bags,), tmp_path, device="tpu"))
+
+
+def test_weights_are_in_the_folder_of_the_run_unless_it_is_said_where(make, tmp_path):
+    make(tmp_path).save()
+    assert load(tmp_path / "weights" / "estimator.safetensors").config.channels == 8
 
 
 def test_what_is_recorded_can_be_learned_from_and_learning_goes_on_where_it_stopped(tmp_path):
