@@ -208,7 +208,7 @@ def _controller(options: Options) -> list[Stage]:
     train, body = "mujoban_controller.train", get_body(options.physics.body)
     turning = _TURNING if body.turn is None else ()
     # Who finds the heading by sight looks around first, as in the stack.
-    look = ("--task.look", str(body.look_ticks)) if body.heading_index is None else ()
+    look = ("--task.look", str(body.seeking_ticks)) if body.seeking_ticks else ()
     return [
         _trainer(
             options, "teacher", (train, "--stage", "teacher", "--algorithm", "mpo", *common,
@@ -222,7 +222,8 @@ def _controller(options: Options) -> list[Stage]:
         ),
         _trainer(
             options, "controller_mpo",
-            (train, "--stage", "mpo", "--initial", str(run / student), "--critic", str(run / _CRITIC), *common),
+            (train, "--stage", "mpo", "--initial", str(run / student), "--critic", str(run / _CRITIC), *common,
+            *look),
             WEIGHTS["controller"], "teacher", "controller_distil",
         ),
     ]  # fmt: skip
@@ -250,19 +251,17 @@ def _planner(options: Options) -> list[Stage]:
 def _senses(options: Options) -> list[Stage]:
     validation = _validation(options)
     found = [validation]
-    earlier = [] if options.before is None else [options.before / PRODUCTS[name] for name in _BAGS]
-    earlier = [folder for folder in earlier if folder.exists()]
-    bags = [str(folder) for folder in earlier]
-    start = None if options.before is None else (options.before / PRODUCTS["estimator"]).parent
-    sources = [] if start is None else [start, *earlier]
+    bags = list[Path]()
+    start = first = None if options.before is None else (options.before / PRODUCTS["estimator"]).parent
     needs = [validation.name]
     for round_ in _BAGS:
         recording = f"bags_{round_}"
         found.append(_recording(options, recording))
-        bags.append(str(options.run / recording))
+        bags.append(options.run / recording)
         name = f"estimator_{round_}"
+        earlier = _earlier_bags(options, name)
         out = options.run / name / "weights"
-        command = ["mujoban_estimator.train", "--bags", *bags, "--out", str(out)]
+        command = ["mujoban_estimator.train", "--bags", *map(str, [*earlier, *bags]), "--out", str(out)]
         command += ["--validation", str(validation.products[0])]
         every = max(1, round(_SENSES_EVALUATIONS * options.hours))
         command += ["--evaluate-every", str(every), "--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
@@ -272,9 +271,21 @@ def _senses(options: Options) -> list[Stage]:
             command += ["--start", str(start)]
         start = out
         needs.append(recording)
+        sources = [] if first is None else [first, *earlier]
         found.append(_trainer(options, name, command, f"{name}/weights", *needs, sources=sources))
         needs.append(name)
     return found
+
+
+def _earlier_bags(options: Options, name: str) -> list[Path]:
+    """Return the bags of the run that is gone on from which a stage reads: those that there are, or were for it."""
+    if options.before is None:
+        return []
+    folders = [options.before / PRODUCTS[round_] for round_ in _BAGS]
+    entry = Pipeline.read(options.run).entries.get(name)
+    if entry is not None and entry.done:
+        return [folder for folder in folders if str(folder) in entry.command]
+    return [folder for folder in folders if folder.exists()]
 
 
 def _validation(options: Options) -> Stage:

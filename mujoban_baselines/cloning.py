@@ -75,7 +75,7 @@ class BagSource(Source[Batch]):
         """
         self._sizes, self._window = (agent.proprio_size, agent.action_size), config.window
         bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
-        self._episodes = EndlessEpisodes(bags, self._read, rng, config.rows)
+        self._episodes = EndlessEpisodes(bags, self._read, rng, config.rows, lambda bag: bag.path.name)
 
     def _read(self, bag: Bag) -> Iterator[Fields]:
         """Yield the fields of a bag's episodes, [L, ...] each."""

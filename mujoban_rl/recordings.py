@@ -28,6 +28,7 @@ class EndlessEpisodes(Generic[RecordingT]):
         read: Callable[[RecordingT], Iterator[Fields]],
         rng: np.random.Generator,
         rows: int,
+        name: Callable[[RecordingT], str] = str,
     ) -> None:
         """Begin every row with a random recording.
 
@@ -36,8 +37,10 @@ class EndlessEpisodes(Generic[RecordingT]):
             read: Yields the fields of a recording's episodes, [L, ...] each with `first`.
             rng: Draws the order.
             rows: R.
+            name: Tells recordings apart when a run goes on.
         """
         self._rng = rng
+        self._names = [name(recording) for recording in recordings]
         self._rows = [_Row(recordings, read, rng) for _ in range(rows)]
 
     def __len__(self) -> int:
@@ -54,12 +57,15 @@ class EndlessEpisodes(Generic[RecordingT]):
 
     def state(self) -> State:
         """Return where the rows are."""
-        own = State({"rng": self._rng.bit_generator.state})
+        own = State({"rng": self._rng.bit_generator.state, "recordings": self._names})
         return State.of({"own": own} | {f"row{i}": row.state() for i, row in enumerate(self._rows)})
 
     def restore(self, state: State) -> None:
-        """Go on where they were."""
-        self._rng.bit_generator.state = state.part("own").values["rng"]
+        """Go on where they were; with other recordings than then, begin anew."""
+        own = state.part("own").values
+        if own.get("recordings", self._names) != self._names:
+            return
+        self._rng.bit_generator.state = own["rng"]
         for i, row in enumerate(self._rows):
             row.restore(state.part(f"row{i}"))
 

@@ -77,10 +77,21 @@ def test_a_run_whose_bags_are_gone_is_continued_with_new_ones_alone(tmp_path: Pa
     assert first[first.index("--bags") + 1 : first.index("--out")] == (str(run / PRODUCTS["first"]),)
 
 
+def test_a_stage_that_is_done_keeps_its_bags_when_those_before_are_gone(tmp_path: Path) -> None:
+    before, run = finished(tmp_path / "before"), tmp_path / "run"
+    done = commands(Options(run=run, before=before))["estimator_first"]
+    run.mkdir()
+    (run / "pipeline.json").write_text(json.dumps({"estimator_first": {"command": done, "done": True}}))
+    (before / PRODUCTS["first"]).unlink()
+    found = commands(Options(run=run, before=before))
+    assert found["estimator_first"] == done and str(before / PRODUCTS["first"]) not in found["estimator_second"]
+
+
 def test_a_body_that_finds_its_heading_by_sight_looks_around_before_it_learns(tmp_path: Path) -> None:
     ball, ant = (commands(Options(run=tmp_path, physics=WorldOptions(body))) for body in ("ball", "ant"))
-    student = ant["controller_distil"]
-    assert student[student.index("--task.look") + 1] == "50" and "--task.look" not in ball["controller_distil"]
+    for stage in ("controller_distil", "controller_mpo"):
+        student = ant[stage]
+        assert student[student.index("--task.look") + 1] == "50" and "--task.look" not in ball[stage]
     assert "--task.instructions.stay" in ant["teacher"] and "--task.instructions.stay" not in ball["teacher"]
 
 

@@ -47,6 +47,15 @@ def test_a_resumed_one_goes_on_as_if_it_had_not_stopped(played: int) -> None:
     assert _ticks(resumed, 30) == _ticks(whole, played + 30)[played:]
 
 
+def test_with_other_recordings_than_before_all_rows_begin_anew() -> None:
+    stopped, whole = _episodes(), _episodes()
+    _ticks(stopped, 5)
+    stopped._names.pop()
+    resumed = _episodes()
+    resumed.restore(stopped.state())
+    assert _ticks(resumed, 20) == _ticks(whole, 20)
+
+
 def test_recordings_without_an_episode_are_refused() -> None:
     nothing = EndlessEpisodes(["a", "b"], lambda name: iter(()), np.random.default_rng(0), 1)
     with pytest.raises(ValueError, match="no episode of 2 ticks in 2 bags"):
