@@ -27,7 +27,7 @@ from mujoban_core.interfaces import ControllerInput
 from mujoban_rl.actors import Actor, ActorOptions, ActorPool, Experience
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.generator import TRAIN_SEEDS, draw_training_seeds, generate_level
 
 _KINDS: Final = ("threads", "processes", "ray")
 
@@ -55,7 +55,7 @@ class CameraActor(Actor):
         """Begin an episode in every row."""
         self._config = config
         self._rng = np.random.default_rng([TRAIN_SEEDS.start, stream])
-        seeds = self._rng.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop, config.levels).tolist()
+        seeds = draw_training_seeds(self._rng, config.levels)
         self._pool = [EpisodeSpec(generate_level(5, seed), seed) for seed in seeds]
         self._world = World(config.batch)
         self._policy = VisuomotorController().eval()

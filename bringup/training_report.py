@@ -159,7 +159,7 @@ def _stages(run: Path, pipeline: Pipeline) -> Iterator[str]:
     yield "| stage | minutes | CPU minutes | samples | updates | last validation |"
     yield "|---|---|---|---|---|---|"
     for stage in pipeline.stages:
-        record = _record(run, stage.products)
+        record = _record(stage.products)
         metrics = record.get("metrics", {})
         scores = ", ".join(f"{k} {readable(v)}" for k, v in metrics.items() if k.startswith((*_RATES, "steps")))
         done = (readable(record[kind]) if kind in record else "" for kind in ("samples", "updates"))
@@ -169,7 +169,7 @@ def _stages(run: Path, pipeline: Pipeline) -> Iterator[str]:
         yield f"| {' | '.join(cells)} |"
 
 
-def _record(run: Path, products: tuple[Path, ...]) -> dict[str, Any]:
+def _record(products: tuple[Path, ...]) -> dict[str, Any]:
     """Return the record of the weights that a stage made, if it made weights."""
     for product in products:
         records = sorted(product.glob("*.json")) if product.is_dir() else [product.with_suffix(".json")]

@@ -20,7 +20,7 @@ from mujoban_rl.engine import State
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.generator import draw_training_seeds, generate_level
 
 Sights = dict[str, NDArray[Any]]
 """What is seen, by name, [B, ...] each."""
@@ -117,7 +117,7 @@ _READERS: Final[dict[str, Callable[[World], NDArray[Any]]]] = {
 
 
 class MujobanTask(Task):
-    """Levels of `TRAIN_SEEDS`, drawn at random, played for the reward of the world."""
+    """Levels for training, drawn at random, played for the reward of the world."""
 
     def __init__(self, config: TaskConfig, rng: np.random.Generator, *, threads: int = 1) -> None:
         """Start an episode in every row; levels and their difficulties come from `rng`."""
@@ -132,11 +132,11 @@ class MujobanTask(Task):
 
     def _begin(self, rows: NDArray[np.int64]) -> None:
         difficulty = self._rng.choice(list(self._shares), len(rows), p=list(self._shares.values()))
-        seeds = self._rng.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop, len(rows))
+        seeds = draw_training_seeds(self._rng, len(rows))
         self._difficulty[rows] = difficulty
         self.world.reset(rows, [
             EpisodeSpec(generate_level(d, seed), seed)
-            for d, seed in zip(difficulty.tolist(), seeds.tolist(), strict=True)
+            for d, seed in zip(difficulty.tolist(), seeds, strict=True)
         ])  # fmt: skip
 
     def observe(self, names: tuple[str, ...]) -> Sights:

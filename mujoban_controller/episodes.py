@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mujoban_sokoban.episodes import EpisodeSpec, after_moves
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.generator import draw_training_seeds, generate_level
 from mujoban_sokoban.solver import solve_level
 
 
@@ -32,9 +32,7 @@ class TrainingEpisodes:
 
     def __call__(self) -> EpisodeSpec:
         """Return the next episode."""
-        seed = int(self._rng.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop))
-        if seed not in TRAIN_SEEDS:
-            raise AssertionError(f"seed {seed} is not a training seed")
+        seed = draw_training_seeds(self._rng, 1)[0]
         level = generate_level(self._difficulty, seed)
         moves = solve_level(level, max_nodes=self._max_nodes).moves
         done = int(self._rng.integers(len(moves))) if len(moves) else 0

@@ -20,6 +20,7 @@ from mujoban_core.bodies import Body
 from mujoban_core.grid import GRID_SIZE, INSTRUCTION_AXES, OFFSETS_XY, cell_to_xy, turn_to_instruction, xy_to_cell
 from mujoban_sim.driving import wrap_angles
 from mujoban_sim.goals import GoalKind
+from mujoban_sim.scene import FOOT_FRICTION
 
 _NEIGHBOURS = np.array([[x, y] for x in (-1, 0, 1, 2) for y in (-1, 0, 1) if (x, y) != (0, 0)], np.float64)
 """Cells around the origin cell whose contents matter, (along, left), [11, 2]."""
@@ -29,8 +30,6 @@ GOAL_SIZE = 4
 _NEAR = 5.0
 """Offsets are told a second time, that much larger and limited to [-1, 1]: what matters is the last tenth of a cell."""
 _GRAVITY = 9.81
-BOX_FRICTION = 0.5
-"""Sliding friction of a box on the floor, in every world; how far a box coasts follows from it."""
 
 
 class Rearrangement(NamedTuple):
@@ -110,7 +109,7 @@ def rest_position(world: GoalView) -> NDArray[np.float64]:
     """Return where the pushed boxes will come to rest if they coast along the instruction, in metres, [B, 2]."""
     goals, rows = world.goals, np.arange(world.batch)
     speed = world.box_speed[rows, goals.box_index].astype(np.float64)
-    coast = speed**2 / (2 * BOX_FRICTION * _GRAVITY)
+    coast = speed**2 / (2 * FOOT_FRICTION * _GRAVITY)
     return world.box_position[rows, goals.box_index].astype(np.float64) + coast[:, None] * OFFSETS_XY[goals.direction]
 
 

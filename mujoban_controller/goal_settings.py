@@ -77,7 +77,6 @@ def judging_config(
     Who does not feel its heading begins with a look around. Without `plans` they are random ones of every kind, and an
     episode ends after 1,000 steps on average.
     """
-    layout = get_body(body)
     return GoalTaskConfig(
         batch=batch,
         body=body,
@@ -87,7 +86,7 @@ def judging_config(
         planned=float(plans),
         astray=0.0,
         horizon=math.inf if plans else 1000.0,
-        look=0 if layout.heading_index is not None else layout.look_ticks,
+        look=get_body(body).seeking_ticks,
         misaligned=0.0,
         overshoot=math.inf,
         patience=12,

@@ -141,6 +141,7 @@ class Options:
     def __post_init__(self) -> None:
         """Reject a device that is not there and bags that nothing would learn from."""
         usable_device(self.device)
+        check_counts(self, "evaluation_episodes", least=0)
         if self.bags and self.config.stage == "teacher":
             raise ValueError("--bags: a teacher does not learn from them; expected --stage distil or mpo")
         if not 0.0 < self.bag_share <= 1.0:

@@ -18,7 +18,7 @@ from mujoban_core.grid import CHANNELS, CONTROL_PERIOD, DIFFICULTIES, GRID_SIZE
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec, LevelSource
-from mujoban_sokoban.generator import TRAIN_SEEDS
+from mujoban_sokoban.generator import draw_training_seeds
 from mujoban_sokoban.levels import Level
 
 Observations = dict[str, Any]
@@ -69,7 +69,7 @@ def observation_space(names: tuple[str, ...], body: Body, max_boxes: int) -> spa
 
 def draw_seed(generator: np.random.Generator) -> int:
     """Return the seed of an episode for which the user gave none; never one of the test levels'."""
-    return int(generator.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop))
+    return draw_training_seeds(generator, 1)[0]
 
 
 def observe(world: World, names: tuple[str, ...]) -> Observations:

@@ -30,6 +30,8 @@ BOX_HALF_EXTENT: Final = (0.4, 0.4, 0.15)
 """Half edges of a box in cells."""
 BOX_MASS: Final = 2.5
 """Mass of a box in kg, the same for every body (paper A.3)."""
+FOOT_FRICTION: Final = 0.5
+"""Sliding friction of a box on the floor, in every world."""
 PEG_HALF_DIAGONAL: Final = 0.05
 """Half diagonal of a peg's square section in metres, the same for every body."""
 PEG_HEIGHT: Final = 0.25
@@ -191,7 +193,8 @@ def _box(index: int, cell_size: float) -> str:
 
 
 def _foot_pair(index: int) -> str:
-    return f'<pair geom1="foot{index}" geom2="floor" condim="3" friction="0.5 0.5 0.005 0.0001 0.0001"/>'
+    friction = f"{FOOT_FRICTION} {FOOT_FRICTION} 0.005 0.0001 0.0001"
+    return f'<pair geom1="foot{index}" geom2="floor" condim="3" friction="{friction}"/>'
 
 
 def parked_position(index: int, cell_size: float) -> NDArray[np.float64]:

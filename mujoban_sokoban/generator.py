@@ -33,6 +33,11 @@ TRAIN_SEEDS: Final = range(10_000_000, 2**62)
 """Seeds of training."""
 
 
+def draw_training_seeds(rng: np.random.Generator, count: int) -> list[int]:
+    """Return the seeds of `count` levels for training."""
+    return rng.integers(TRAIN_SEEDS.start, TRAIN_SEEDS.stop, count).tolist()
+
+
 def seed_range(first: int, count: int = 1) -> str:
     """Return the range in which seeds from `first` on lie: test, validation or training.
 

@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from mujoban_msgs_py.ros2.session import CommandError, Session, add_discovery_options, full_name, is_hidden
 from mujoban_msgs_py.ros2.verbs import Verbs
 
-ACTION_PARTS = ("/_action/feedback", "/_action/status", "/_action/send_goal", "/_action/cancel_goal")
-
 
 def add_verbs(commands: Verbs) -> None:
     """Add the family to the parser."""

@@ -170,6 +170,11 @@ def test_the_best_product_on_validation_levels_is_exported(teacher, tmp_path):
     assert float(load_weights(PrivilegedPolicy, tmp_path / "teacher.safetensors").log_scale.detach().max()) == 0.0
 
 
+def test_a_number_of_validation_levels_below_none_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="evaluation_episodes is -5: expected at least 0"):
+        Options(tmp_path, STAGES["ppo"], evaluation_episodes=-5)
+
+
 def test_a_run_directory_belongs_to_one_configuration(tmp_path):
     make_trainer(Options(tmp_path, STAGES["ppo"], evaluation_episodes=0)).save()
     with pytest.raises(RunError, match="steps"):
