@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.paper import bodies, curves, figures, film, tables
-from benchmarks.paper.baselines import JOINT
+from benchmarks.paper.baselines import HOURS, JOINT
 from benchmarks.paper.runs import (
     ALL,
     CONFIGURATIONS,
@@ -49,6 +49,11 @@ those that ship now; the JSON has the digests of its weights, and every episode.
 TABLE_1 = """The agents that modular RL is compared with ([how each is trained](../baselines.md)). The
 paper trained them for up to 21 days with 1,000 actors (fully observable) and 5 days with 256 (partially observable),
 and reports the best of many settings; here steps and CPU hours are what the row was given.
+"""
+BUDGETS = f"""Every row but that of the stack as it ships is given the environment steps of the modular row and its
+{HOURS:g} h of two cores, whichever is spent first. Not counted are the recording of what is cloned, and the weights of
+the stack that ships where a row begins with them. `--seed 1 --run runs/baselines/NAME_seed1` trains the row NAME
+once more. The commands are
 """
 FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
 where one begins, and the axes of rates are cut. The [model cards](../models/) have the scores of the weights that ship.
@@ -87,7 +92,7 @@ def rebuild(folder: Path) -> Path:
         tables.configurations((CONFIGURATIONS[0], POLICY_ALONE[0])),
         TABLE_1,
         tables.baselines(),
-        "Every row but that of the stack as it ships is given the same hours of two cores, by\n",
+        BUDGETS,
         tables.commands(),
         "Why episodes of difficulty 5 fail, before fine-tuning as a whole and after:\n",
         tables.failures((POLICY_ALONE[0], JOINT.run(POLICY_ALONE[0].difficulty))),

@@ -36,10 +36,17 @@ _KINDS: Final = ("solved", "return")
 
 HOURS: Final = 1.0
 """Of wall-clock on two cores that every row may take, the modular stack's as well."""
-BUDGET: Final = f"--steps {2_500_000 * HOURS:.0f} --cpu-seconds {2 * 3600 * HOURS:.0f}"
-"""What completes a run of an agent, whichever comes first; the same for all."""
-RECORDING: Final = "python bringup/record.py --out bags/stack --undisturbed --episodes 512"
-"""Records what is cloned; without `--undisturbed` the disturbances would be cloned too."""
+_STEPS: Final = round(1_250_000 * HOURS)
+"""Environment steps of every row until those of the modular one are known: an hour's share of what two hours took."""
+_CLONED: Final = 1 / 3
+"""Share of a row's budget that its cloning takes, where it learns by itself after that."""
+_START: Final = "_start"
+"""Ends the run directory of such a cloning."""
+RECORDING: Final = (
+    "python bringup/record.py --out bags/stack --undisturbed --advanced 0 --time-limit 0 --episodes 512"
+)
+"""Records what is cloned: whole episodes, since hardly one of difficulty 5 ends within the default's 30 s; without
+`--undisturbed` the disturbances would be cloned too."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +65,12 @@ class Baseline:
     roles: tuple[str, ...] = ()
     """Modules that it leaves, in the place of an agent; they play with those that ship, without a search ahead."""
     program: str = "mujoban_baselines.train"
-    budget: str = BUDGET
+    cloning: str = ""
+    """Arguments of a cloning of whose weights it begins, which takes `_CLONED` of its budget."""
     weights: str = ""
     """Folder of its run that holds the weights."""
+    seed: int = 0
+    """Of the run; with another one, the same is trained once more."""
 
     @property
     def folder(self) -> Path:
@@ -68,9 +78,27 @@ class Baseline:
         return ROOT / "runs" / "baselines" / self.name
 
     @property
-    def command(self) -> str:
-        """The command that trains it."""
-        return f"python -m {self.program} {self.method} {self.budget} --run runs/baselines/{self.name}"
+    def commands(self) -> tuple[str, ...]:
+        """The commands that train it, one after the other."""
+        run = f"runs/baselines/{self.name}"
+        if self.program != "mujoban_baselines.train":
+            return (f"python -m {self.program} {self.method} --hours {HOURS:g} --run {run}",)
+        if not self.cloning:
+            return (self._trains(self.method, 1.0, run),)
+        start = f"{self.method} --start {run}{_START}/agent.safetensors"
+        return self._trains(self.cloning, _CLONED, run + _START), self._trains(start, 1.0 - _CLONED, run)
+
+    def _trains(self, method: str, share: float, run: str) -> str:
+        """Return the command of a training with a share of the budget, whichever part of which is spent first."""
+        seed = f" --seed {self.seed}" if self.seed else ""
+        # The learner and the robots each have a core, as the stages of the modular row have both.
+        actors = "" if method.startswith("clone") else " --actors processes --num-actors 1"
+        budget = f"--steps {steps() * share:.0f} --cpu-seconds {2 * 3600 * HOURS * share:.0f}"
+        return f"python -m {self.program} {method}{seed} {budget}{actors} --run {run}"
+
+    def again(self, seed: int) -> Baseline:
+        """Return the same row with another seed."""
+        return replace(self, name=f"{self.name}_seed{seed}", title=f"{self.title}, seed {seed}", seed=seed)
 
     @property
     def curve(self) -> Path:
@@ -87,11 +115,21 @@ class Baseline:
         return replace(run, modules=modules, further=sources.ALONE)
 
 
+def steps() -> int:
+    """Return the environment steps of every row: those that the modular one took, once that is measured.
+
+    Raises:
+        ResultError: If its file is not what this program writes.
+    """
+    measured = points_of(MODULAR)
+    return measured[-1]["step"] if measured else _STEPS
+
+
 _ROBOT, _ABOVE = "o_cam, o_pr, o_pos", "o_top, o_pr"
 _PARTIAL, _FULL, _NOT = "5 days, 256 actors", "21 days, 1,000 actors", "not there"
 MODULAR: Final = Baseline(
-    "modular", "modular", _ROBOT, "hard, bottom-up ([how](../weights.md))", f"--world {DEFAULT_WORLD}",
-    "7 days, 200 to 1,000 actors a module", tuple(ROLES), "bringup.train_all", f"--hours {HOURS:g}", "weights",
+    "modular", "modular", _ROBOT, "all difficulties, bottom-up ([how](../weights.md))", f"--world {DEFAULT_WORLD}",
+    "7 days, 200 to 1,000 actors a module", tuple(ROLES), "bringup.train_all", weights="weights",
 )  # fmt: skip
 """The stack, from nothing within the same hours."""
 BASELINES: Final = (
@@ -102,8 +140,7 @@ BASELINES: Final = (
     Baseline("mpo_easy", "MPO, asym.", _ROBOT, "easy", "monolithic-mpo --levels easy", _PARTIAL),
     Baseline(
         "mpo_cloned", "MPO, asym., after cloning the stack", _ROBOT, "curriculum; the clone's bags",
-        "monolithic-mpo --levels curriculum --mpo.critic-first 1000 --start runs/baselines/clone/agent.safetensors",
-        _NOT,
+        "monolithic-mpo --levels curriculum --mpo.critic-first 1000", _NOT, cloning="clone --bags bags/stack",
     ),
     Baseline("clone", "cloning of the stack alone", _ROBOT, "bags", "clone --bags bags/stack", _NOT),
     Baseline("vtrace", "V-trace", _ABOVE, "curriculum", "monolithic-vtrace", _FULL),
@@ -115,7 +152,9 @@ BASELINES: Final = (
 )  # fmt: skip
 """The stack, the agents of appendix D, a monolithic one that may copy, the stack fine-tuned for the task's reward."""
 JOINT: Final = BASELINES[-1]
-RUNS: Final = tuple(baseline.run(d) for baseline in BASELINES for d in DIFFICULTIES)
+AGAIN: Final = tuple(baseline.again(1) for baseline in BASELINES[1:])
+"""The agents once more, with another seed; they are shown where they were measured."""
+RUNS: Final = tuple(baseline.run(d) for baseline in (*BASELINES, *AGAIN) for d in DIFFICULTIES)
 """Their evaluations."""
 
 
@@ -130,6 +169,8 @@ class Options:
 def read_curve(run: Path) -> list[dict[str, Any]]:
     """Return at most `_MOST` points of a run, each the mean over a stretch of it; of the stack's, what it cost alone.
 
+    What a cloning before it took counts as taken before its first step.
+
     Raises:
         ResultError: If it has no metrics.
     """
@@ -138,10 +179,12 @@ def read_curve(run: Path) -> list[dict[str, Any]]:
     lines = read_metrics(run)
     if not lines:
         raise ResultError(f"{run}: its metrics are empty")
+    start = run.with_name(run.name + _START)
+    before = read_metrics(start)[-1] if start.exists() else {}
     points = []
     for part in np.array_split(np.array(lines, object), min(len(lines), _MOST)):
-        point: dict[str, Any] = {"step": part[-1]["step"]}
-        point |= {kind: round(part[-1].get(kind) or 0.0) for kind in ("cpu_seconds", "seconds")}
+        spent = ("step", "cpu_seconds", "seconds")
+        point: dict[str, Any] = {kind: round((part[-1].get(kind) or 0) + before.get(kind, 0)) for kind in spent}
         for kind in _KINDS:
             seen = {d: [line[f"{kind}/{d}"] for line in part if f"{kind}/{d}" in line] for d in DIFFICULTIES}
             known = {str(d): [value for value in values if value is not None] for d, values in seen.items()}
@@ -170,7 +213,7 @@ def points_of(baseline: Baseline) -> list[dict[str, Any]]:
 
 def note(given: Sequence[str]) -> None:
     """Write the curves of runs, given as NAME=RUN."""
-    known = {baseline.name: baseline for baseline in BASELINES}
+    known = {baseline.name: baseline for baseline in (*BASELINES, *AGAIN)}
     for text in given:
         name, equals, run = text.partition("=")
         if not equals or name not in known:

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.paper import runs as sources
-from benchmarks.paper.baselines import BASELINES, points_of
+from benchmarks.paper.baselines import AGAIN, BASELINES, points_of
 from benchmarks.paper.curves import MODULES
 from benchmarks.paper.runs import ResultError, Run, is_stale, load
 from mujoban_core.grid import DIFFICULTIES
@@ -72,7 +72,7 @@ def save_rates(figure: Figure, axes: Axes, file: Path) -> None:
 
 def baseline_curves(file: Path) -> bool:
     """Draw success and return of the baselines in training against steps; return False when there is no curve."""
-    found = [(row, points) for row in BASELINES if (points := points_of(row))]
+    found = [(row, points) for row in (*BASELINES, *AGAIN) if (points := points_of(row))]
     if not found:
         return False
     figure, panels = plt.subplots(2, len(DIFFICULTIES), figsize=(14, 5), layout="constrained", sharex=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.paper.baselines import BASELINES, MODULAR, RECORDING, points_of
+from benchmarks.paper.baselines import AGAIN, BASELINES, MODULAR, RECORDING, points_of
 from benchmarks.paper.runs import DIFFICULTY, Run, is_stale, load
 from mujoban_core.grid import DIFFICULTIES
 
@@ -70,7 +70,7 @@ def baselines() -> str:
     rates = _rates(DIFFICULTY)
     title = "modular, as it ships, the planner's policy alone"
     rows = [[title, "o_cam, o_pr, o_pos", MODULAR_LEVELS, *_cost([]), MODULAR.paper, *rates]]
-    for row in BASELINES:
+    for row in (*BASELINES, *(again for again in AGAIN if points_of(again))):
         cost = _cost(points_of(row))
         rows.append([row.title, row.sees, row.levels, *cost, row.paper, *_rates([row.run(d) for d in DIFFICULTIES])])
     return _table(header, rows)
@@ -78,7 +78,7 @@ def baselines() -> str:
 
 def commands() -> str:
     """Return the commands that train the rows of Table 1, as a block of code."""
-    return "".join(f"    {line}\n" for line in (RECORDING, *(row.command for row in BASELINES)))
+    return "".join(f"    {line}\n" for line in (RECORDING, *(c for row in BASELINES for c in row.commands)))
 
 
 def _cost(points: Sequence[dict[str, Any]]) -> list[str]:

@@ -223,14 +223,47 @@ def test_the_fine_tuned_stack_has_a_row_and_its_failures_beside_what_it_came_fro
 
 
 def test_every_row_is_trained_by_a_command_that_exists_with_the_same_budget(capsys):
-    for row in baselines.BASELINES:
-        assert row.command in tables.commands()
-        _, _, program, *arguments = row.command.split()
-        if row is baselines.MODULAR:
-            assert program == train_all.PROG and read_options(train_all.Options, arguments, PROG).hours == 1.0
-            continue
-        assert program == PROG and baselines.BUDGET in row.command
-        assert isinstance(read_options(COMMANDS, arguments, PROG), COMMANDS[arguments[0]])
+    for row in (*baselines.BASELINES, *baselines.AGAIN):
+        steps = cpu_seconds = 0.0
+        for command in row.commands:
+            assert row in baselines.AGAIN or command in tables.commands()
+            _, _, program, *arguments = command.split()
+            if row is baselines.MODULAR:
+                assert program == train_all.PROG and read_options(train_all.Options, arguments, PROG).hours == 1.0
+                continue
+            options = read_options(COMMANDS, arguments, PROG)
+            assert program == PROG and isinstance(options, COMMANDS[arguments[0]])
+            assert options.config.seed == row.seed and options.run.name.startswith(row.name)
+            steps, cpu_seconds = steps + options.config.steps, cpu_seconds + options.config.cpu_seconds
+        whole = pytest.approx((baselines.steps(), 7200.0), abs=1.0)
+        assert row is baselines.MODULAR or (steps, cpu_seconds) == whole
+
+
+def test_agents_get_the_steps_that_the_modular_row_took(folder):
+    assert "--steps 1250000" in baselines.JOINT.commands[0]
+    taken = {"step": 1_300_000, "cpu_seconds": 7000, "seconds": 3500, "solved": {}, "return": {}}
+    baselines.MODULAR.curve.write_text(json.dumps(taken))
+    assert "--steps 1300000" in baselines.JOINT.commands[0]
+
+
+def test_what_a_cloning_before_took_counts(folder, tmp_path):
+    for name, step in (("run_start", 300), ("run", 1000)):
+        (tmp_path / name).mkdir()
+        line = {"step": step, "cpu_seconds": step / 10, "seconds": step / 20}
+        (tmp_path / name / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    assert baselines.main([f"mpo_cloned={tmp_path / 'run'}"]) == 0
+    row = next(row for row in baselines.BASELINES if row.name == "mpo_cloned")
+    point = baselines.points_of(row)[-1]
+    assert (point["step"], point["cpu_seconds"], point["seconds"]) == (1300, 130, 65)
+
+
+def test_another_seed_of_a_row_is_shown_where_it_was_measured(folder):
+    assert "seed 1 |" not in results.rebuild(folder).read_text()
+    again = next(row for row in baselines.AGAIN if row.name == "mpo_easy_seed1")
+    again.curve.write_text(json.dumps({"step": 5, "cpu_seconds": 1, "seconds": 1, "solved": {}, "return": {}}))
+    write(again.run(1), 3, 4, {})
+    page = results.rebuild(folder).read_text()
+    assert "| MPO, asym., seed 1 | o_cam, o_pr, o_pos | easy |" in page and "75.0 % (30.1 to 95.4)" in page
 
 
 def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_path):
@@ -251,7 +284,7 @@ def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_pat
     write(run, 2, 4, {})
     page = results.rebuild(folder).read_text()
     cells = "1.50 M | 1.0 | 0.5 | 7 days, 200 to 1,000 actors a module | 4 | - | - | - | - | 50.0 % (15.0 to 85.0)"
-    assert f"| modular | o_cam, o_pr, o_pos | hard, bottom-up ([how](../weights.md)) | {cells} |" in page
+    assert f"| modular | o_cam, o_pr, o_pos | all difficulties, bottom-up ([how](../weights.md)) | {cells} |" in page
 
 
 @pytest.fixture
