@@ -22,9 +22,10 @@ _VIEWS = 6
 _COMPLETE = 0.5
 """Share of the hidden states in which all that can be seen was seen; of the rest there are a few views."""
 _UNSEEN = {WALL: (2.8, -1.0), TARGET: (-2.5, -5.0), BOX: (-2.2, -5.8)}
-"""Layer -> mean logit of the shipped estimator in cells that were never in view, where it is set and where it is not.
+"""Layer -> mean logit of an estimator in cells that were never in view, where it is set and where it is not.
 
-Measured, as the constants below, over 100,000 such cells of bags of the running stack.
+Measured, as the constants below, over 100,000 such cells of bags of the running stack, with an estimator before the one
+that ships, whose guesses tell less apart (docs/research/planner.md).
 """
 _ROCK = 4.0
 """The same for walls that no view can reach, once all else was seen."""
