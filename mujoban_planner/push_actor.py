@@ -26,6 +26,8 @@ from mujoban_rl.engine import State
 from mujoban_rl.precision import autocast
 
 BOARDS = BitBoards._fields
+STEP = ("push", "reward", "terminated", "truncated")
+"""What is delivered of a step beside the state before it."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ class PushActor(Actor):
     """Samples pushes from a policy; a step is a push. Levels are those at which there is most to learn.
 
     Delivered are, [T, E] each, the state before the push (`wall`, `target`, `box`, `agent`), `push`, `reward` (scaled),
-    `over` (nothing follows) and `log_prob`; and the states after the last pushes, `last_wall` and so on, [E].
+    `terminated`, `truncated` (see `PushStep`) and `log_prob`; and the states after the last pushes, `last_wall` and so
+    on, [E].
     """
 
     def __init__(self, network: NetworkConfig, config: PlayConfig, seed: int, stream: int) -> None:
@@ -81,7 +84,7 @@ class PushActor(Actor):
     def act(self) -> Experience:
         """Play T pushes in every level."""
         config, environment = self.config, self._environment
-        seen: dict[str, list[NDArray[Any]]] = {name: [] for name in (*BOARDS, "push", "reward", "over", "log_prob")}
+        seen: dict[str, list[NDArray[Any]]] = {name: [] for name in (*BOARDS, *STEP, "log_prob")}
         statistics: dict[str, list[float]] = {f"solved/{d}": [] for d in DIFFICULTIES} | {"moves_per_push": []}
         for _ in range(config.steps):
             with autocast("cpu"):
@@ -90,7 +93,8 @@ class PushActor(Actor):
             before = {name: column.copy() for name, column in environment.boards._asdict().items()}
             step = environment.step(push[:, 0].numpy())
             chosen = log_policy.gather(1, push)[:, 0].numpy()
-            values = (push[:, 0].numpy(), step.reward * np.float32(config.reward_scale), step.over, chosen)
+            reward = step.reward * np.float32(config.reward_scale)
+            values = (push[:, 0].numpy(), reward, step.terminated, step.truncated, chosen)
             for name, value in zip(seen, (*before.values(), *values), strict=True):
                 seen[name].append(value)
             statistics["moves_per_push"].append(float(step.moves.mean()))

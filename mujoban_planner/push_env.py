@@ -37,10 +37,17 @@ class PushStep(NamedTuple):
     """Environment's reward during walk and push, plus `STEP_REWARD` for each of their moves."""
     solved: NDArray[np.bool_]
     """Whether the level is solved."""
-    over: NDArray[np.bool_]
-    """Whether the episode is: solved, at the move limit, without a further push, or hopeless."""
+    terminated: NDArray[np.bool_]
+    """Whether nothing more can be won: solved, without a further push, or hopeless."""
+    truncated: NDArray[np.bool_]
+    """Whether the move limit ended the episode, perhaps on the way to the box, and nothing else did."""
     moves: NDArray[np.int64]
     """Moves of walk and push."""
+
+    @property
+    def over(self) -> NDArray[np.bool_]:
+        """Whether the episode is."""
+        return self.terminated | self.truncated
 
 
 class PushEnvironment:
@@ -88,9 +95,8 @@ class PushEnvironment:
         if push.shape != (self.batch,):
             raise ValueError(f"pushes of shape {push.shape}: expected ({self.batch},)")
         reward = np.zeros(self.batch, np.float32)
-        solved, over = np.zeros((2, self.batch), np.bool_)
-        moves = np.zeros(self.batch, np.int64)
-        step = PushStep(reward, solved, over, moves)
+        solved, terminated, truncated = np.zeros((3, self.batch), np.bool_)
+        step = PushStep(reward, solved, terminated, truncated, np.zeros(self.batch, np.int64))
         wrong = _step(*self.boards, self._dead, self.moves, self.move_limit, push, *step)
         if wrong >= 0:
             raise ValueError(f"push {push[wrong]} in level {wrong} of the batch: expected one of `possible()`")
@@ -135,14 +141,16 @@ def _step(
     push: NDArray[np.int64],
     reward: NDArray[np.float32],
     solved: NDArray[np.bool_],
-    over: NDArray[np.bool_],
+    terminated: NDArray[np.bool_],
+    truncated: NDArray[np.bool_],
     moves: NDArray[np.int64],
 ) -> int:
     """Push in every level; return the first in which that is not possible, or -1."""
     distance = np.empty(SQUARES, np.int8)
     for i in range(len(agent)):
         if box[i] == target[i] or total[i] >= limit:
-            solved[i], over[i] = box[i] == target[i], True
+            solved[i] = terminated[i] = box[i] == target[i]
+            truncated[i] = not solved[i]
             continue
         free = ~(wall[i] | box[i])
         direction, square = push[i] // SQUARES, push[i] % SQUARES
@@ -156,7 +164,7 @@ def _step(
         total[i] += moves[i]
         reward[i] = STEP_REWARD * moves[i]
         if moves[i] <= walk:  # the limit came on the way
-            over[i] = True
+            truncated[i] = True
             continue
         to = square + SQUARE_STEP[direction]
         gain = np.int64(target[i] & bit(to) != NONE) - np.int64(target[i] & bit(square) != NONE)
@@ -170,5 +178,6 @@ def _step(
         for way in range(4):
             further |= pushable(reached, free, box[i], way)
         lost = further == NONE or hopeless(box[i], wall[i], target[i], dead[i])
-        over[i] = solved[i] or total[i] >= limit or lost
+        terminated[i] = solved[i] or lost
+        truncated[i] = total[i] >= limit and not terminated[i]
     return -1

@@ -21,7 +21,7 @@ from torch.nn import functional
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards, signed
-from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
+from mujoban_planner.push_actor import BOARDS, STEP, PlayConfig, PushActor
 from mujoban_planner.push_policy import PushPolicy, images
 from mujoban_planner.push_run import PushRunConfig, starting_anchor, starting_policy, training_record
 from mujoban_planner.symmetry import SYMMETRIES
@@ -38,7 +38,7 @@ from mujoban_rl.replay import SequenceBuilder, SequenceReplay
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
 
-_KEPT: Final = (*BOARDS, "push", "reward", "over")
+_KEPT: Final = (*BOARDS, *STEP)
 """What is kept of a step."""
 Window = dict[str, Tensor]
 """Successive steps from the replay, [B, n + 1] each."""
@@ -121,10 +121,11 @@ class PushMPOLearner(Learner[Window]):
         """Take a step of policy, critic and dual variables."""
         config = self.config
         self._schedule.follow(progress)
-        over = batch["over"][:, :-1]
-        returns = windowed_returns(batch["reward"][:, :-1], over, torch.zeros_like(over), config.discount)
-        rows = torch.arange(len(over))
-        symmetry = self._rng.integers(0, SYMMETRIES, len(over))
+        # How many moves are left is not seen: a step that time cuts short does not count.
+        reward, terminated, truncated = (batch[name][:, :-1] for name in ("reward", "terminated", "truncated"))
+        returns = windowed_returns(reward, terminated, truncated, config.discount)
+        rows = torch.arange(len(reward))
+        symmetry = self._rng.integers(0, SYMMETRIES, len(rows))
         first, last = (_boards(batch, rows, at) for at in (torch.zeros_like(rows), returns.index))
         with torch.no_grad(), autocast("cpu"):
             before, after = self.target(first, symmetry), self.target(last, symmetry)
@@ -133,7 +134,7 @@ class PushMPOLearner(Learner[Window]):
             output = self.policy(first, symmetry)
         policy_loss, stats = self.mpo(output.logits, before.logits, before.q)
         taken = output.q.gather(1, images(batch["push"][:, 0].numpy(), symmetry)[:, None])[:, 0]
-        q_loss = functional.smooth_l1_loss(taken, goal)
+        q_loss = (functional.smooth_l1_loss(taken, goal, reduction="none") * returns.valid).mean()
         loss = policy_loss + config.q_weight * q_loss
         parts = {"q_loss": q_loss}
         if self._anchor is not None:

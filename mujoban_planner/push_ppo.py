@@ -18,7 +18,7 @@ from torch.distributions import Categorical
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards
-from mujoban_planner.push_actor import BOARDS, PlayConfig, PushActor
+from mujoban_planner.push_actor import BOARDS, STEP, PlayConfig, PushActor
 from mujoban_planner.push_run import PushRunConfig, starting_anchor, starting_policy, training_record
 from mujoban_planner.validation import success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Arrays, Rollouts
@@ -125,8 +125,10 @@ class PushPPOLearner(Learner[Arrays]):
         boards = BitBoards._make(np.concatenate([batch[name], batch[f"last_{name}"][None]]).ravel() for name in BOARDS)
         with torch.no_grad(), autocast("cpu"):
             value = self.policy(boards).value.view(length + 1, levels)
-        reward, over = (torch.from_numpy(batch[name].copy()) for name in ("reward", "over"))
-        discount = self.config.discount * (~over).float()
+        reward, terminated, truncated = (torch.from_numpy(batch[name].copy()) for name in STEP[1:])
+        # How many moves are left is not seen: what time cuts short is worth what was held of it, and teaches nothing.
+        reward = torch.where(truncated, value[:-1], reward)
+        discount = self.config.discount * (~(terminated | truncated)).float()
         advantage, target = generalised_advantages(reward, discount, value[:-1], value[-1], self.config.decay)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
         return advantage.flatten(), target.flatten()

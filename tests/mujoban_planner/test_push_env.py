@@ -87,12 +87,13 @@ def test_episodes_end_when_solved_at_the_limit_and_where_no_solution_is_left_at_
     for _ in range(25):
         step = env.step(random_pushes(env.possible(), rng))
         assert (env.moves <= 25).all()
-        hopeless = step.over & ~step.solved & (env.moves < 25)
+        hopeless = step.terminated & ~step.solved
+        assert (step.truncated <= (env.moves == 25)).all() and not (step.terminated & step.truncated).any()
         if hopeless.any():
             lost = level_batch(type(env.boards)._make(column[hopeless] for column in env.boards))
             assert (solve_batch(lost).status == Status.UNSOLVABLE).all()
             ended.add("hopeless")
-        ended |= {"limit"} if (env.moves == 25).any() else set()
+        ended |= {"limit"} if step.truncated.any() else set()
         over = np.flatnonzero(step.over)
         env.reset_to(over, bit_boards(take_levels(LEVELS, over)))
     assert ended == {"hopeless", "limit"}

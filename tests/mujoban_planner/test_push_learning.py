@@ -14,6 +14,7 @@ from mujoban_planner.push_policy import Anchor, PushPolicy, images
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
 from mujoban_rl.actors import Experience
 from mujoban_rl.engine import Cadence
+from mujoban_rl.limits import NaNGuard
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import save_weights
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
@@ -76,6 +77,23 @@ def test_the_loss_teaches_the_push_head_and_the_trunk_but_no_other_head(make, tm
     assert not {"readout.policy", "readout.dead", "readout.push_dead", "readout.walk", "readout.plan"} & changed
 
 
+def ended(trainer, by):
+    """Return the learner of a run, and its first batch with a large reward and an end `by` either in every step."""
+    trainer.source.publish(trainer.learner.weights(), 0)
+    batch = trainer.source.next_batch()
+    trainer.source.close()
+    flags = {name: batch[name] | True if name == by else batch[name] & False for name in ("terminated", "truncated")}
+    return trainer.learner, {**batch, **flags, "reward": batch["reward"] + 100.0}
+
+
+@pytest.mark.parametrize(("by", "taught"), [("terminated", True), ("truncated", False)])
+def test_an_end_by_time_is_no_end_to_the_critic(by, taught, tmp_path):
+    learner, batch = ended(ppo(tmp_path / "ppo"), by)
+    assert (learner._advantages(batch)[1].mean() > 50.0) == taught
+    learner, batch = ended(mpo(tmp_path / "mpo"), by)
+    assert (learner.update(batch, 0.5, NaNGuard())["q_loss"] > 1.0) == taught
+
+
 def deliver(replay, source, number, actor=0):
     """Add four pushes in each level; the target tells where they come from, the wall which pushes they are."""
     mark = np.arange(4 * number, 4 * number + 5, dtype=np.uint64)[:, None].repeat(16, 1)
@@ -83,7 +101,8 @@ def deliver(replay, source, number, actor=0):
     arrays = {name: values[:4] for name, values in boards.items()}
     arrays |= {f"last_{name}": values[4] for name, values in boards.items()}
     arrays |= {"push": np.zeros((4, 16), np.int64), "reward": np.zeros((4, 16), np.float32)}
-    replay.add(Experience(arrays | {"over": np.zeros((4, 16), bool)}, 64, actor=actor))
+    arrays |= {name: np.zeros((4, 16), bool) for name in ("terminated", "truncated")}
+    replay.add(Experience(arrays, 64, actor=actor))
 
 
 def test_a_replay_goes_on_with_more_or_fewer_actors():
