@@ -8,18 +8,26 @@ program; docs/swap_a_planner.md says more.
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 
 from bringup.command import Choice, Stack
 from bringup.evaluate import evaluate
+from bringup.options import whole
 from bringup.results import report, summary
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import Memory, Planner
 from mujoban_core.plugins import ROLES
+from mujoban_core.program import exit_status, read_options
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import VALIDATION_SEEDS
+
+PROG = "replace_a_module.py"
 
 
 class RandomPlanner(Planner):
@@ -36,14 +44,24 @@ class RandomPlanner(Planner):
         return np.array(moves, np.int64), (decisions + 1,)
 
 
-def main(episodes: int) -> None:
-    """Play the same levels with either planner."""
-    levels = Episodes(episodes, 0, difficulty=1)
+@dataclass(frozen=True)
+class Options:
+    """Play the same easy levels for validation with either planner."""
+
+    episodes: Annotated[int, whole("EPISODES"), tyro.conf.Positional] = 32
+    """Number of levels."""
+
+
+def main(command_line: Sequence[str] | None = None) -> int:
+    """Play and print both reports."""
+    options = read_options(Options, command_line, PROG, __doc__)
+    levels = Episodes(options.episodes, VALIDATION_SEEDS.start, difficulty=1)
     oracles = Stack({role: Choice(role, "oracle") for role in ROLES}).policy()
     for name, policy in {"oracle": oracles, "random": replace(oracles, planner=RandomPlanner())}.items():
         results = evaluate(policy, levels, time_limit=1200)
         print(f"{name} planner", *summary(report(results, {"planner": name})), sep="\n  ")
+    return 0
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 32)
+    sys.exit(exit_status(PROG, main))

@@ -3,13 +3,18 @@
 import runpy
 import sys
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bringup.rollout import ticks
 from bringup.rollout_recorder import Recorder
+from mujoban_core.agent import OWN_SENSES, AgentInput, AgentPolicy
 from mujoban_core.bodies import BALL
+from mujoban_core.files import digest
+from mujoban_core.plugins import ROLES
 from mujoban_sim.presets import WORLDS
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
@@ -33,22 +38,102 @@ def run(monkeypatch, capsys, tmp_path):
     return example
 
 
-def test_a_policy_is_trained_with_a_well_known_library(run):
-    assert "over 2 episodes" in run("train_with_a_library.py", 8)
+@pytest.fixture
+def trained(run):
+    """Return what the training example prints; the policy is in the working directory then."""
+    return run("train_with_a_library.py", 8)
+
+
+@pytest.fixture
+def agents():
+    """Return what the evaluating example defines."""
+    return runpy.run_path(str(EXAMPLES / "evaluate_beside_the_stack.py"))
+
+
+def make():
+    """Return the environment of the training example."""
+    return runpy.run_path(str(EXAMPLES / "train_with_a_library.py"))["make"]()
+
+
+@pytest.mark.parametrize("stack", [(), ("--oracle", ",".join(ROLES))], ids=["learned", "oracles"])
+def test_a_policy_is_trained_with_a_well_known_library_and_evaluated_beside_the_stack(run, trained, stack):
+    assert "over 2 episodes" in trained
+    said = run("evaluate_beside_the_stack.py", "--episodes", 1, "--time-limit", 1200, *stack)
+    policy, modules = said.split("\nstack\n")
+    assert policy.startswith("trained policy\n  solved ") and " of 1 " in policy
+    assert f"privileged, told the ground truth: agent: weights {digest('ppo_mujoban.zip')[:12]}" in policy
+    assert modules.startswith("  solved 1 of 1") and ("estimator: oracle" in modules) == bool(stack)
 
 
 def test_the_environment_of_the_librarys_example_is_one_that_libraries_take():
     from gymnasium.utils.env_checker import check_env
 
-    env = runpy.run_path(str(EXAMPLES / "train_with_a_library.py"))["make"]()
+    env = make()
     check_env(env.unwrapped, skip_render_check=True)
     observation, _ = env.reset(seed=0)
-    assert observation.ndim == 1 and env.observation_space.contains(observation)
+    assert env.observation_space.contains(observation)
+    assert set(observation) == {"proprio", "pose", "abstract_state"} <= set(AgentInput._fields)
 
 
-def test_an_agent_is_evaluated_beside_the_stack(run):
-    said = run("evaluate_beside_the_stack.py", 2)
-    assert "wanderer\n  solved" in said and "stack of oracles\n  solved 2 of 2" in said
+def test_the_agent_does_what_the_librarys_policy_does_in_the_environment_that_it_learned_in(trained, agents):
+    from stable_baselines3 import PPO
+
+    model, env, seed = PPO.load("ppo_mujoban"), make(), TRAIN_SEEDS.start
+    policy, world = AgentPolicy(agents["Trained"]()), World(1, max_boxes=1)
+    observation, _ = env.reset(seed=seed)
+    for tick in islice(ticks(policy, world, [EpisodeSpec(generate_level(1, seed), seed)]), 20):
+        torque, _ = model.predict(observation, deterministic=True)
+        np.testing.assert_allclose(tick.decision.torque[0], torque, atol=1e-6)
+        observation, *_ = env.step(tick.decision.torque[0])
+
+
+def test_a_policy_that_was_trained_on_the_task_itself_sees_what_the_robot_sees(run, agents):
+    import gymnasium
+    from stable_baselines3 import PPO
+
+    # Untrained, which is all one to who plays it.
+    PPO("MultiInputPolicy", gymnasium.make("Mujoban-v0", difficulty=1), n_steps=8, device="cpu").save("ppo_mujoban")
+    policy = AgentPolicy(agents["Trained"]())
+    assert set(policy.sees) == set(OWN_SENSES) and policy.cameras == ("first_person",) and not policy.privileged
+    said = run("evaluate_beside_the_stack.py", "--episodes", 1, "--time-limit", 5, "--oracle", ",".join(ROLES))
+    assert "agent: " not in said.split("\nstack\n")[0]
+
+
+def test_a_policy_of_another_body_is_one_line(run, trained):
+    said = run("evaluate_beside_the_stack.py", "--body", "ant")
+    assert said.endswith("error: the agent was trained for the body ball: expected weights for ant, or an oracle\n")
+    assert said.count("\n") == 1
+
+
+def test_a_policy_whose_observations_have_no_names_is_one_line(run):
+    from gymnasium.wrappers import FlattenObservation
+    from stable_baselines3 import PPO
+
+    PPO("MlpPolicy", FlattenObservation(make()), n_steps=8, device="cpu").save("flat")
+    said = run("evaluate_beside_the_stack.py", "flat.zip")
+    assert "error: flat.zip is a policy whose observations have no names: expected one that" in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["train_with_a_library.py", "evaluate_beside_the_stack.py"])
+def test_a_library_that_is_missing_is_one_line(run, monkeypatch, name):
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    said = run(name)
+    assert said == f"{name}: error: stable_baselines3 is not installed: expected pip install 'mujoban[examples]'\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "argument", "said"),
+    [
+        ("train_with_a_library.py", "many", "[STEPS]: many, expected a whole number from 2 on"),
+        ("evaluate_beside_the_stack.py", "none.zip", "no policy at none.zip: expected one that train_with_a_library"),
+        ("evaluate_beside_the_stack.py", __file__, f"{__file__} is no policy of PPO"),
+        ("replace_a_module.py", "0", "[EPISODES]: 0, expected a whole number from 1 on"),
+    ],
+)
+def test_a_bad_argument_is_one_line(run, name, argument, said):
+    line = run(name, argument)
+    assert line.startswith(f"{name}: error: {said}") and line.count("\n") == 1
 
 
 def test_a_module_is_replaced(run):
