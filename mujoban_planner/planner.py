@@ -93,11 +93,16 @@ class LearnedPlanner(Compilable, Planner):
         """The read-out."""
         return self.readout
 
-    def forward(self, abstract_state: Tensor) -> PlannerOutput:
-        """Return the heads' outputs for abstract states, float [B, N, N, 4] with values in [0, 1]."""
+    def forward(self, abstract_state: Tensor, *, follow: bool = True) -> PlannerOutput:
+        """Return the heads' outputs.
+
+        Args:
+            abstract_state: [B, N, N, 4] with values in [0, 1].
+            follow: Whether the policy follows the push head without teaching it. Otherwise what teaches the policy
+                teaches the pushes too, but never the verdicts, which are facts.
+        """
         output, planes = self.read(abstract_state)
-        # The policy follows the push head without teaching it.
-        wanted = (output.push + verdicts(output)).detach()
+        wanted = (output.push.detach() if follow else output.push) + verdicts(output).detach()
         return output._replace(policy=output.policy + self.heads.guide(wanted, planes))
 
     def read(self, abstract_state: Tensor) -> tuple[PlannerOutput, Tensor]:

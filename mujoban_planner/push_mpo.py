@@ -208,13 +208,25 @@ class PushReplay(ReplayStore[Window]):
         return parts
 
     def restore(self, state: State) -> None:
-        """Take over what `state` returned, of as many actors or not."""
+        """Take over what `state` returned, of as many actors or not.
+
+        Raises:
+            ValueError: If other things were kept of a step then.
+        """
+        _check_kept(state.part("replay"))
         super().restore(state)
         for i, builder in enumerate(self._builders):
             if f"actor{i}" in state.values:
                 part = state.part(f"actor{i}")
+                _check_kept(part.part("builder"))
                 builder.restore(part.part("builder"))
                 self._after[i] = {name: values.numpy() for name, values in part.part("after").tensors.items()}
+
+
+def _check_kept(steps: State) -> None:
+    """Raise ValueError if steps are held, and other things of them than a learner reads."""
+    if steps.tensors and steps.tensors.keys() != set(_KEPT):
+        raise ValueError(f"of pushes it holds {', '.join(sorted(steps.tensors))}: expected {', '.join(sorted(_KEPT))}")
 
 
 def push_mpo(

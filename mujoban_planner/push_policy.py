@@ -1,6 +1,7 @@
 """A planner network as a policy over pushes, taught by the loss of a reinforcement learner, with a critic.
 
-Shapes: B states, C channels, I = 8; A = 256 pushes, the flat index 64 * direction + square of the box.
+Shapes: B states, N = `grid.GRID_SIZE`, C channels, D = 4 directions, I = 8; A = 256 pushes, the flat index
+64 * direction + square of the box.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_planner.boards import BitBoards, state_tensor
+from mujoban_planner.heads import PlannerOutput
 from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.propagation import legal_pushes, propagate
 from mujoban_planner.push_env import possible_masks
 from mujoban_planner.reinforcement import silence_verdicts
 from mujoban_planner.symmetry import push_images
@@ -119,12 +122,35 @@ class Anchor:
         for new, old in ((now.policy, before.policy), (now.plan, before.plan)):
             spread = functional.kl_div(new.log_softmax(1), old.log_softmax(1), reduction="none", log_target=True)
             loss = loss + spread.sum(1).mean()
-        loss = loss + _bernoulli_divergence(now.dead, before.dead).mean()
-        if now.push_dead is not None and before.push_dead is not None:
-            # Of pushes that are not possible nobody asks.
-            possible = _possible(boards, symmetry).view_as(now.push_dead)
-            loss = loss + _bernoulli_divergence(now.push_dead, before.push_dead)[possible].mean()
-        return self._weight * loss
+        possible = _possible(boards, symmetry).view_as(now.push)
+        return self._weight * (loss + _verdict_divergence(now, before, possible))
+
+    def verdict_loss(self, now: PlannerOutput, states: Tensor) -> Tensor:
+        """Return how far the verdicts alone have come from those of the beginning, in all states, which may be unsure.
+
+        Args:
+            now: What the planner that learns says of them.
+            states: [B, N, N, 4] with values in [0, 1].
+        """
+        with torch.no_grad():
+            before, planes = self._before.read(states)
+            possible = legal_pushes(planes, propagate(planes)[:, 0])
+        return self._weight * _verdict_divergence(now, before, possible)
+
+
+def _verdict_divergence(now: PlannerOutput, before: PlannerOutput, possible: Tensor) -> Tensor:
+    """Return the mean KL(before || now) of the verdicts on instructions, plus that of the verdicts on pushes.
+
+    Args:
+        now: Of the one that learns.
+        before: Of the one that it was.
+        possible: How certainly each push is possible, [B, D, I, I]: of others nobody asks.
+    """
+    loss = _bernoulli_divergence(now.dead, before.dead).mean()
+    if now.push_dead is None or before.push_dead is None:
+        return loss
+    drift = _bernoulli_divergence(now.push_dead, before.push_dead)
+    return loss + (drift * possible).sum() / possible.sum().clamp(min=1e-6)
 
 
 def _possible(boards: BitBoards, symmetry: NDArray[np.int64] | None) -> Tensor:

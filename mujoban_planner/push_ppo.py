@@ -130,7 +130,7 @@ class PushPPOLearner(Learner[Arrays]):
         reward = torch.where(truncated, value[:-1], reward)
         discount = self.config.discount * (~(terminated | truncated)).float()
         advantage, target = generalised_advantages(reward, discount, value[:-1], value[-1], self.config.decay)
-        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6)
+        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-6) * ~truncated
         return advantage.flatten(), target.flatten()
 
     def weights(self) -> Mapping[str, Tensor]:

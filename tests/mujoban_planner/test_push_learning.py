@@ -15,6 +15,7 @@ from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
 from mujoban_rl.actors import Experience
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
+from mujoban_rl.run_directory import RunError
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import save_weights
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
@@ -92,6 +93,36 @@ def test_an_end_by_time_is_no_end_to_the_critic(by, taught, tmp_path):
     assert (learner._advantages(batch)[1].mean() > 50.0) == taught
     learner, batch = ended(mpo(tmp_path / "mpo"), by)
     assert (learner.update(batch, 0.5, NaNGuard())["q_loss"] > 1.0) == taught
+
+
+@pytest.mark.parametrize(("by", "after"), [("terminated", 7.0), ("truncated", 50.0)])
+def test_a_return_goes_on_with_the_value_of_the_state_in_which_time_ran_out(by, after, tmp_path):
+    """The second push ends the episode and pays 7; all states are held to be worth 50, and rewards discounted by 0.97.
+
+    `after` is what follows the first push, which pays 3.
+    """
+    learner, batch = ended(ppo(tmp_path / "ppo"), by)
+    batch["reward"] = np.float32([3.0, 7.0, 0.0, 0.0])[:, None].repeat(16, 1)
+    batch[by] = np.arange(4)[:, None].repeat(16, 1) == 1
+    learner.policy.board[-1].bias.data.fill_(50.0)
+    advantage, target = (x.view(4, 16) for x in learner._advantages(batch))
+    assert (target[1] == after).all() and (advantage[1] == 0.0).all() == (by == "truncated")
+    carried = 0.97 * 0.95 * (after - 50.0)
+    torch.testing.assert_close(target[0], torch.full((16,), 3.0 + 0.97 * 50.0 + carried))
+
+    learner, batch = ended(mpo(tmp_path / "mpo"), by)
+    batch["reward"] = torch.tensor([3.0, 7.0, 0.0, 0.0]).repeat(32, 1)
+    batch[by] = (torch.arange(4) == 1).repeat(32, 1)
+    learner.target.board[-1].bias.data.fill_(50.0)
+    found = learner.update(batch, 0.5, NaNGuard())["mean_return"]
+    assert found == pytest.approx(3.0 + 0.97 * after, rel=1e-3)
+
+
+def test_a_run_that_kept_other_things_of_a_push_is_refused_in_words(tmp_path, monkeypatch):
+    mpo(tmp_path).run(limit_updates=2)
+    monkeypatch.setattr("mujoban_planner.push_mpo._KEPT", ("push", "over"))
+    with pytest.raises(RunError, match=r"another version or kind of run \(of pushes it holds agent, .*: expected over"):
+        mpo(tmp_path)
 
 
 def deliver(replay, source, number, actor=0):
