@@ -107,9 +107,11 @@ class VTraceLearner(Learner[Arrays]):
         named["vtrace/beyond"] = float(beyond.detach())
         if "pseudo_reward" in ticks:
             pseudo = self.pseudo_value(output.features).squeeze(-1)
+            # The policy is one, and so is the bonus for its entropy.
             extra, aside = self._loss(
-                log_prob, ticks["log_prob"], entropy, pseudo, ticks["pseudo_reward"], ticks["pseudo_over"]
-            )
+                log_prob, ticks["log_prob"], torch.zeros_like(entropy), pseudo, ticks["pseudo_reward"],
+                ticks["pseudo_over"],
+            )  # fmt: skip
             loss = loss + self.config.auxiliary * extra
             earned = ticks["pseudo_reward"].mean()
             named |= {"subgoal/value_loss": float(aside.value_loss), "subgoal/reward": float(earned)}

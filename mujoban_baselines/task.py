@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mujoban_core.bodies import get_body
 from mujoban_core.camera import TOP_DOWN_CAMERA
 from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
 from mujoban_rl.engine import State
@@ -86,9 +87,9 @@ class TaskConfig:
 
     levels: Levels = "hard"
     """Difficulties: the hardest alone, the curriculum over all of them, or the easiest alone."""
-    episode_seconds: float = 45.0
-    """Time limit of episodes, the paper's for partially observable agents (C.5); evaluation has that of the body, 240 s
-    for the ball."""
+    episode_seconds: float | None = 45.0
+    """Time limit of episodes, the paper's for partially observable agents (C.5); None: the body's, as in evaluation,
+    240 s for the ball."""
     robots: int = 64
     """B, of each actor."""
     body: str = "ball"
@@ -103,6 +104,8 @@ class TaskConfig:
     @property
     def steps(self) -> int:
         """Time limit of episodes in steps."""
+        if self.episode_seconds is None:
+            return get_body(self.body).time_limit
         return round(self.episode_seconds / CONTROL_PERIOD)
 
 

@@ -34,6 +34,7 @@ from mujoban_baselines.joint.learner import joint_parts
 from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
 from mujoban_baselines.task import MujobanTask, TaskConfig
+from mujoban_core.bodies import get_body
 from mujoban_core.program import read_options, run_command
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.bags.training import bags_digest
@@ -44,8 +45,6 @@ from mujoban_rl.weights import load_weights, origin, provenance
 
 PROG = "mujoban_baselines.train"
 Size = Literal["S", "M", "L"]
-WHOLE = 240.0
-"""Seconds of an episode in evaluation, for those that train without an earlier end."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class RunConfig:
         return Budget(samples=self.steps, cpu_seconds=self.cpu_seconds)
 
     @property
-    def data(self) -> dict[str, str]:
+    def data(self) -> dict[str, Any]:
         """What it learns from, as far as this says it, for the record."""
         return {}
 
@@ -76,10 +75,10 @@ class PlayConfig(RunConfig):
     task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(default_factory=TaskConfig)
 
     @property
-    def data(self) -> dict[str, str]:
-        """The levels that are played, and their world."""
+    def data(self) -> dict[str, Any]:
+        """The levels that are played, their world, and the steps of an episode, whoever set them."""
         levels = f"own play of generated levels ({self.task.levels}), training seeds"
-        return {"data": levels, "world": self.task.world}
+        return {"data": levels, "world": self.task.world, "time_limit": self.task.steps}
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,7 @@ class VTraceRunConfig(PlayConfig):
     """A run of V-trace."""
 
     task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(
-        default_factory=lambda: TaskConfig(levels="curriculum", episode_seconds=WHOLE)
+        default_factory=lambda: TaskConfig(levels="curriculum", episode_seconds=None)
     )
     vtrace: VTraceTrainingConfig = field(default_factory=VTraceTrainingConfig)
 
@@ -120,11 +119,16 @@ class JointRunConfig(PlayConfig):
     """A joint fine-tuning of planner and controller."""
 
     task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(
-        default_factory=lambda: TaskConfig(robots=32, episode_seconds=WHOLE)
+        default_factory=lambda: TaskConfig(robots=32, episode_seconds=None)
     )
     start: StartingWeights = field(default_factory=StartingWeights)
     """Weights of the four modules; by default what ships."""
     joint: Annotated[JointSettings, tyro.conf.arg(name="")] = field(default_factory=JointSettings)
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """Also the ticks of a look around."""
+        return {**super().data, "look_around": self.joint.turn(get_body(self.task.body))}
 
 
 Parts = tuple[Learner[Any], Source[Any]]
@@ -290,7 +294,8 @@ class Joint(_Command):
         """Make or resume the run."""
         config = self.config
         parts = joint_parts(config.task, config.start, config.joint, config.seed, self.actors)
-        return make_trainer(config, parts, self.run, self.cadence(50, 5), "joint", start=config.start.digests())
+        start = config.start.digests(config.task.body)
+        return make_trainer(config, parts, self.run, self.cadence(50, 5), "joint", start=start)
 
 
 COMMANDS: dict[str, type[_Command]] = {

@@ -20,9 +20,10 @@ from mujoban_baselines.joint.stack import DrawingController, DrawingPlanner
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_controller.controller import MEMORY_FIELDS, VisuomotorController
 from mujoban_controller.goal_features import privileged_features
+from mujoban_core.bodies import get_body
 from mujoban_core.grid import CHANNELS, GRID_SIZE, INSTRUCTION_LIMIT
 from mujoban_core.interfaces import Observation, renew_rows
-from mujoban_core.look_around import look_around
+from mujoban_core.look_around import LookAroundController, look_around
 from mujoban_core.sense_plan_act import Decision, PolicyState, SensePlanAct
 from mujoban_core.trees import leaves, map_leaves
 from mujoban_planner.networks import ARCHITECTURES
@@ -84,17 +85,20 @@ class JointActor(Actor):
         self._task, self._networks = task, networks
         self._generator = torch.Generator().manual_seed(seed)
         self._rng = np.random.default_rng(seed)
-        own, turn = settings.controller, settings.look_around
+        own, body = settings.controller, get_body(networks.controller.body)
+        turn = settings.turn(body)
         for network in networks:
             network.eval()
         planner = DrawingPlanner(networks.planner, self._generator)
         controller = DrawingController(networks.controller, self._generator, own.explore)
-        self._turns = turn > 0
+        looking = [look_around(module, turn, body=body) for module in (planner, controller)]
+        # The controller of a body that no single action turns does so itself, and learns it like all else.
+        self._turns = isinstance(looking[1], LookAroundController)
         self._stack = SensePlanAct(
-            mujoban_estimator.load(start.estimator, compiled=False),
-            mujoban_estimator.load_termination(start.termination, compiled=False),
-            look_around(planner, turn), look_around(controller, turn),  # pyright: ignore[reportArgumentType]
-        )  # fmt: skip
+            mujoban_estimator.load(start.path("estimator", body.name), compiled=False),
+            mujoban_estimator.load_termination(start.path("termination", body.name), compiled=False),
+            *looking,  # pyright: ignore[reportArgumentType]
+        )
         self._builder = SequenceBuilder(own.sequence, own.skipped)
         self._log = DecisionLog(task.batch, settings.planner.n_step, settings.planner.discount)
         self._state: PolicyState = self._fresh()

@@ -13,17 +13,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-import mujoban_controller
 import mujoban_planner
 from mujoban_baselines.joint.actor import DECISION, MAP, Networks, make_actor
 from mujoban_baselines.joint.decisions import FIELDS
+from mujoban_baselines.joint.planner import TaughtPlanner
 from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.task import TaskConfig
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.mpo import MPOLearner
 from mujoban_controller.privileged import Critic
 from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch
-from mujoban_planner.planner import LearnedPlanner
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.limits import NaNGuard
@@ -90,7 +89,8 @@ class JointLearner(Learner[JointBatch]):
         self.controller = MPOLearner(
             networks.controller.train(), body, settings.controller, generator, critic=critic
         )
-        self.planner = DiscreteMPOLearner(settings.planner.mpo, networks.planner)
+        self._taught = TaughtPlanner(networks.planner, settings.planner.anchor)
+        self.planner = DiscreteMPOLearner(settings.planner.mpo, self._taught)
 
     @property
     def _parts(self) -> dict[str, Learner[Any]]:
@@ -120,6 +120,7 @@ class JointLearner(Learner[JointBatch]):
         stats = {f"controller/{k}": v for k, v in self.controller.update(batch.ticks, progress, guard).items()}
         if batch.decisions is not None:
             stats |= {f"planner/{k}": v for k, v in self.planner.update(batch.decisions, progress, guard).items()}
+            stats["planner/drift"] = self._taught.drift
         return stats
 
     def weights(self) -> Mapping[str, Tensor]:
@@ -130,8 +131,8 @@ class JointLearner(Learner[JointBatch]):
         """Write `controller.safetensors` and `planner.safetensors` with their records."""
         self.controller.export(directory, record)
         target = self.planner.target
-        assert isinstance(target, LearnedPlanner)
-        save_weights(directory.path / "planner.safetensors", target, target.config, record)
+        assert isinstance(target, TaughtPlanner)
+        save_weights(directory.path / "planner.safetensors", target.planner, target.planner.config, record)
 
 
 def joint_parts(
@@ -144,12 +145,9 @@ def joint_parts(
     """
     torch.manual_seed(seed)  # the critic's initial weights
     networks = Networks(
-        load_weights(VisuomotorController, start.controller or mujoban_controller.SHIPPED),
-        mujoban_planner.load(start.planner, compiled=False),
+        load_weights(VisuomotorController, start.path("controller", task.body), body=task.body),
+        mujoban_planner.load(start.path("planner", task.body), compiled=False),
     )
-    if networks.controller.body != task.body:
-        body = networks.controller.body
-        raise ValueError(f"--start.controller {start.controller}: of the body {body}, expected {task.body}")
     streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(2)]
     generators = [torch.Generator().manual_seed(stream) for stream in streams]
     factory = partial(make_actor, task, networks.plans(), start, settings, seed)

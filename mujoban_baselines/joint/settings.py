@@ -6,15 +6,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mujoban_controller.mpo import MPOTrainingConfig
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import Body
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
+from mujoban_core.ranges import check_not_negative
 from mujoban_planner.discrete_mpo import MPOSettings
 
 
 @dataclass(frozen=True)
 class StartingWeights:
-    """Where the modules come from; by default what ships."""
+    """Where the modules come from; by default what ships for the body."""
 
     controller: Path | None = None
     planner: Path | None = None
@@ -23,9 +24,13 @@ class StartingWeights:
     termination: Path | None = None
     """Stays as it is."""
 
-    def digests(self) -> dict[str, str]:
+    def path(self, role: str, body: str) -> Path:
+        """Return where the weights of a module are: those given, or those that ship for a body."""
+        return getattr(self, role) or shipped_weights(role, body)
+
+    def digests(self, body: str) -> dict[str, str]:
         """Return the digest of the weights of each module, for the record."""
-        return {role: digest(getattr(self, role) or shipped_weights(role)) for role in ROLES}
+        return {role: digest(self.path(role, body)) for role in ROLES}
 
 
 @dataclass(frozen=True)
@@ -43,9 +48,12 @@ class PlannerSettings:
     rate: float = 3e-5
     critic_first: int = 400
     """Updates in which its critic learns alone."""
+    anchor: float = 1.0
+    """How much it counts that its verdicts on what is deadly go on saying what they said; 0 lets them drift."""
 
     def __post_init__(self) -> None:
-        """Reject what holds no decision."""
+        """Reject what holds no decision, and an anchor that pushes away."""
+        check_not_negative(self, "anchor")
         for name in ("batch", "replay", "n_step"):
             if getattr(self, name) < 1:
                 raise ValueError(f"planner: {name} {getattr(self, name)}: expected at least 1")
@@ -60,8 +68,9 @@ class PlannerSettings:
 class JointSettings:
     """How the stack plays, and how planner and controller learn from it."""
 
-    look_around: int = BALL.look_ticks
-    """Ticks of a turn on the spot while the map is uncertain, 0 for none; in such turns nobody learns to drive."""
+    look_around: int | None = None
+    """Ticks of a turn on the spot while the map is uncertain, 0 for none, None for the body's; in such turns nobody
+    learns to drive."""
     controller: MPOTrainingConfig = field(
         default_factory=lambda: MPOTrainingConfig(
             window=16, windows=16, sequence=16, replay=24_000, first=8_000, reuse=1.0, gamma=0.99, critic_first=400,
@@ -73,9 +82,13 @@ class JointSettings:
 
     def __post_init__(self) -> None:
         """Reject contradictions."""
-        if self.look_around < 0:
+        if self.look_around is not None and self.look_around < 0:
             raise ValueError(f"look_around {self.look_around}: expected a number of ticks, 0 for none")
         if self.controller.sequence != self.controller.window:
             raise ValueError(
                 f"controller: sequence {self.controller.sequence}: expected the window's {self.controller.window} ticks"
             )
+
+    def turn(self, body: Body) -> int:
+        """Return the ticks of a turn on the spot of a body."""
+        return body.look_ticks if self.look_around is None else self.look_around

@@ -1,5 +1,6 @@
 """The stack fine-tuned as a whole: what is learned from, what is not, and the promises of every trainer."""
 
+import copy
 import json
 import math
 
@@ -12,16 +13,22 @@ import mujoban_planner
 from mujoban_baselines.joint.actor import Networks, make_actor
 from mujoban_baselines.joint.decisions import DecisionLog
 from mujoban_baselines.joint.learner import JointBatch, joint_parts
+from mujoban_baselines.joint.planner import TaughtPlanner
 from mujoban_baselines.joint.settings import JointSettings, PlannerSettings, StartingWeights
 from mujoban_baselines.task import TaskConfig
 from mujoban_baselines.train import JointRunConfig, main, make_trainer
 from mujoban_controller.mpo import MPOTrainingConfig
+from mujoban_core.bodies import ANT, BALL
 from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
+from mujoban_planner.boards import abstract_states
+from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch, MPOSettings
+from mujoban_planner.networks import ResidualPlanner
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.testing import check_refusal, check_resuming
+from mujoban_sokoban.generator import generate_batch
 
 TASK = TaskConfig(levels="easy", robots=2, episode_seconds=1.2)
 CONTROLLER = MPOTrainingConfig(
@@ -120,6 +127,45 @@ def test_policies_are_held_while_their_critics_learn_and_move_after_that():
     source.close()
 
 
+def taught(anchor):
+    """Teach a planner what is worth what at random; return it, what it began with, states and losses of Q."""
+    torch.manual_seed(0)
+    start = ResidualPlanner(8, 1, judge=True)
+    planner = copy.deepcopy(start)
+    learner = DiscreteMPOLearner(MPOSettings(learning_rate=1e-2), TaughtPlanner(planner, anchor))
+    states = torch.from_numpy(abstract_states(generate_batch(4, range(64))))
+    instruction, reward = torch.arange(64) % 5, torch.linspace(-2.0, 2.0, 64)
+    batch = MPOBatch(states, instruction, reward, torch.zeros(64), states, torch.ones(64, dtype=torch.bool))
+    losses = [learner.update(batch, 0.0, NaNGuard())["q_loss"] for _ in range(40)]
+    return planner.eval(), start.eval(), states, losses
+
+
+def test_verdicts_stay_what_they_were_while_the_trunk_learns_what_earns():
+    drift = {}
+    for anchor in (0.0, 1.0):
+        planner, start, states, losses = taught(anchor)
+        with torch.no_grad():
+            now, before = planner(states), start(states)
+        possible = now.push > -5.0  # of others nobody asks
+        moves, pushes = (getattr(now, k).sigmoid() - getattr(before, k).sigmoid() for k in ("dead", "push_dead"))
+        drift[anchor] = np.array([float(moves.abs().mean()), float(pushes[possible].abs().mean())])
+        assert losses[-1] < 0.5 * losses[0]
+    assert (drift[1.0] < 0.5 * drift[0.0]).all(), drift
+
+
+def test_what_teaches_the_policy_teaches_the_pushes_and_not_what_is_deadly():
+    planner = mujoban_planner.load(compiled=False)
+    states = torch.from_numpy(abstract_states(generate_batch(4, range(64))))
+    answers = TaughtPlanner(planner, 0.0)(states), planner(states)
+    torch.testing.assert_close(answers[0].policy, answers[1].policy)
+    heads = planner.heads
+    for answer, reached in zip(answers, (True, False), strict=True):
+        planner.zero_grad()
+        answer.policy.log_softmax(1)[:, 1].sum().backward()
+        assert (heads.push.weight.grad is not None and bool(heads.push.weight.grad.any())) == reached
+        assert heads.push_dead[-1].weight.grad is None and heads.dead.weight.grad is None
+
+
 def decisions_of(actor, sequences):
     """Return how many decisions are finished in so many sequences of three new ticks each."""
     return sum(len(actor.act().arrays["decision/reward"]) for _ in range(sequences))
@@ -149,6 +195,21 @@ def test_turns_on_the_spot_are_nobodys_driving_and_other_torques_are_drawn():
     actor.close()
 
 
+def test_the_ant_plays_with_its_own_modules_turns_as_long_as_it_takes_and_drives_itself_meanwhile():
+    task = TaskConfig(levels="easy", robots=1, body="ant")
+    learner, source = learner_and_source(task=task)
+    source.close()
+    settings = JointSettings(controller=CONTROLLER, planner=SMALL.planner)
+    assert settings.turn(ANT) == ANT.look_ticks != settings.turn(BALL) == BALL.look_ticks
+    actor = make_actor(task, learner.networks.plans(), StartingWeights(), settings, 0, 0)
+    actor.set_weights(learner.weights(), 0)
+    arrays = [actor.act().arrays for _ in range(3)]
+    actor.close()
+    assert all((part["instruction"] == int(Instruction.STAY)).all() and part["driven"].all() for part in arrays)
+    with pytest.raises(ValueError, match="of the body ball, expected ant"):
+        joint_parts(task, StartingWeights(controller=mujoban_controller.SHIPPED), SMALL, 0, ActorOptions())
+
+
 def test_the_command_leaves_both_modules_with_the_digests_of_all_they_came_from(tmp_path):
     run = tmp_path / "run"
     options = ["--robots", "1", "--levels", "easy", "--episode-seconds", "0.5", "--steps", "1", "--seconds", "0"]
@@ -156,6 +217,7 @@ def test_the_command_leaves_both_modules_with_the_digests_of_all_they_came_from(
     for role, shipped in (("controller", mujoban_controller.SHIPPED), ("planner", mujoban_planner.SHIPPED)):
         record = json.loads((run / f"{role}.json").read_text())
         assert record["start"][role] == digest(shipped) and record["training"]["method"] == "joint"
+        assert (record["time_limit"], record["look_around"]) == (10, BALL.look_ticks)
         assert record["start"].keys() == {"estimator", "termination", "planner", "controller"}
     mujoban_planner.load(run / "planner.safetensors")
     mujoban_controller.load(run / "controller.safetensors")

@@ -27,9 +27,11 @@ from mujoban_baselines.train import (
     mpo_parts,
     vtrace_parts,
 )
+from mujoban_core.bodies import ANT, BALL
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
+from mujoban_rl.losses.vtrace import VTraceConfig
 from mujoban_rl.networks import Gaussian
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_sokoban.generator import TRAIN_SEEDS
@@ -172,6 +174,7 @@ def test_a_run_by_command_leaves_an_agent_and_a_curve(tmp_path, capsys):
     assert main(["monolithic-vtrace", "--run", str(run), *options, *small]) == 0
     record = json.loads((run / "agent.json").read_text())
     assert record["class"] == TopDownAgent.__name__ and record["training"]["method"] == "monolithic-vtrace"
+    assert record["time_limit"] == 10
     curve = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert record["samples"] >= 60 and curve[-1]["step"] == record["samples"], "what came last is in the curve"
     assert {"solved/1", "return/1", "cpu_seconds"} <= curve[-1].keys()
@@ -191,8 +194,25 @@ def test_numbers_out_of_their_range_are_refused_by_name_before_anything_is_playe
 
 def test_v_trace_and_the_whole_stack_play_to_the_end_of_what_is_evaluated():
     """The stack needs 82 s of difficulty 5 on average; the paper ends partially observable agents' episodes early."""
-    assert MPORunConfig().task.episode_seconds == 45.0
-    assert VTraceRunConfig().task.episode_seconds == JointRunConfig().task.episode_seconds == 240.0
+    assert MPORunConfig().task.steps == 45 * 20
+    for body in (BALL, ANT):
+        for config in (VTraceRunConfig(), JointRunConfig()):
+            task = replace(config.task, body=body.name)
+            assert task.steps == body.time_limit == replace(config, task=task).data["time_limit"]
+
+
+def test_the_entropy_of_a_policy_that_has_subgoals_counts_once(monkeypatch):
+    losses = []
+    monkeypatch.setattr("mujoban_baselines.impala.guarded_step", lambda loss, *_, **__: losses.append(loss.item()))
+    for auxiliary in (0.0, 0.5):
+        for weight in (0.0, 1.0):
+            unroll = VTraceTrainingConfig(unroll=3, auxiliary=auxiliary, loss=VTraceConfig(entropy_weight=weight))
+            config = VTraceRunConfig(task=TaskConfig(robots=2), vtrace=unroll)
+            learner, source = vtrace_parts(config, StructuredAgent, ActorOptions(), partial(SquaresTask, batch=2))
+            source.publish(learner.weights(), 0)
+            learner.update(source.next_batch(), 0.0, NaNGuard())
+    alone, beside = losses[0] - losses[1], losses[2] - losses[3]
+    assert alone != 0.0 and beside == pytest.approx(alone, abs=1e-4) and losses[0] != losses[2]
 
 
 def test_symmetric_critics_teach_the_torso_and_asymmetric_ones_do_not():
