@@ -158,10 +158,10 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
         """Take one gradient step of policy, critic and dual variables."""
         config, batch = self.config, batch.to(self.device)
         with torch.no_grad(), autocast(self.device):
-            before, after = self._answers(self.target, batch.state), self._answers(self.target, batch.last)
+            before, after = self.answers(self.target, batch.state), self.answers(self.target, batch.last)
         target = batch.reward + batch.bootstrap * self.value(after)
         with autocast(self.device):
-            output = self._answers(self.network, batch.state)
+            output = self.answers(self.network, batch.state)
         policy_loss, stats = self.mpo(output.policy, before.policy, before.q)
         if self._updates < config.critic_first:
             policy_loss = functional.kl_div(
@@ -170,11 +170,14 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
         taken = output.q.gather(1, batch.instruction[:, None])[:, 0]
         errors = functional.smooth_l1_loss(taken, target, reduction="none")
         q_loss = (errors * batch.valid).sum() / batch.valid.sum().clamp(min=1)
-        guarded_step(policy_loss + config.q_weight * q_loss, [self._adam, self._dual_adam], guard, clip=_CLIP)
+        beside = self.further_losses(output, batch.state)
+        loss = policy_loss + config.q_weight * q_loss + sum(beside.values())
+        guarded_step(loss, [self._adam, self._dual_adam], guard, clip=_CLIP)
         self._updates += 1
         if self._updates % config.target_period == 0:
             self.target.load_state_dict(self.network.state_dict())
-        return {"q_loss": q_loss.item(), "mean_reward": batch.reward.mean().item()} | scalars(stats._asdict())
+        losses = {name: value.item() for name, value in {"q_loss": q_loss, **beside}.items()}
+        return {**losses, "mean_reward": batch.reward.mean().item()} | scalars(stats._asdict())
 
     def value(self, answer: Answer) -> Tensor:
         """Return what states are worth, [B]."""
@@ -184,6 +187,11 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
         """Return the online network, which actors play with."""
         return self.network.state_dict()
 
-    @staticmethod
-    def _answers(network: nn.Module, states: Tensor) -> Answer:
+    def answers(self, network: nn.Module, states: Tensor) -> Answer:
+        """Return what the online or the target network says of states, float32 [B, ...]."""
         return network(states)
+
+    def further_losses(self, answer: Answer, states: Tensor) -> Mapping[str, Tensor]:
+        """Return what is added to the loss, by name, given what the online network said of states; nothing."""
+        del answer, states
+        return {}

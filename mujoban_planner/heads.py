@@ -116,7 +116,7 @@ class PlannerHeads(nn.Module):
         """
         if self.walk is None:
             return 0.0
-        wanted = wanted - wanted.amax((1, 2, 3), keepdim=True)
+        wanted = wanted - wanted.amax((1, 2, 3), keepdim=True).detach()
         towards, start = walk_to_push(wanted.exp(), planes)
         return functional.pad(self.walk[0] * towards + self.walk[1] * start, (1, 0))
 

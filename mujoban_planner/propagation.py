@@ -86,7 +86,8 @@ def walk_to_push(push: Tensor, planes: Tensor) -> tuple[Tensor, Tensor]:
     """
     floor, agent, box = planes[:, 0], planes[:, AGENT], planes[:, BOX]
     free = torch.minimum(floor, 1.0 - box)
-    wanted = push / push.amax((1, 2, 3), keepdim=True).clamp(min=1e-6)
+    # The scale is no part of what is learned: through it the most wanted push would get no gradient.
+    wanted = push / push.amax((1, 2, 3), keepdim=True).detach().clamp(min=1e-6)
     # A push in direction d starts in the cell whose neighbour in direction d holds the box.
     boxes = _neighbours(functional.pad(wanted, (1, 1, 1, 1)))
     start = torch.stack([boxes[d][:, d] for d in range(4)], 1)  # Shape [B, D, I, I]

