@@ -53,7 +53,9 @@ class Choice:
         return cls(role, text)
 
     def of(self, body: str) -> Choice:
-        """Return the same with the weights that ship for a body, where it takes those that ship."""
+        """Return the same with the weights that ship for a body, or its oracle, where it takes those that ship."""
+        if (self.role, self.source) == ("controller", ORACLE):
+            return oracle(self.role, body)
         return replace(self, weights=chosen_weights(self.role, self.source, self.weights, body))
 
     def load(self, device: str = "cpu") -> Module:

@@ -109,6 +109,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
             "scripted driver": "supervised, by a scripted driver that knows the truth, on its own play",
             "distil": "supervised, by a teacher that knows the truth, on its own play",
             "mpo": "by reward, with a critic that knows the truth",
+            "mpo, nothing gained": "by reward, with a critic that knows the truth, which solved no more levels: the "
+            "weights from before were kept",
         },
         "controller",
     ),
@@ -181,7 +183,10 @@ def _ways(record: Mapping[str, Any]) -> list[str]:
     """Return what a record says of how its weights learned: a teacher that is no network, methods or the stage."""
     if record.get("teacher") in _NAMED_TEACHERS:
         return [record["teacher"]]
-    return str(record.get("method") or record["training"].get("stage") or "").split(" then ")
+    stage = record.get("training", {}).get("stage")
+    if stage == "mpo" and record.get("initial"):
+        return ["distil", "mpo, nothing gained" if record.get("evaluation") == 0 else "mpo"]
+    return str(record.get("method") or stage or "").split(" then ")
 
 
 def _guide(page: str, docs: str | None) -> str:
@@ -227,9 +232,11 @@ def _scores(record: Mapping[str, Any], place: Place, scores: Sequence[Score]) ->
     if scores:
         yield f"As part of the stack, on {place.levels}:"
         yield _table(("configuration", "oracles", "levels", "solved", "95 % interval"), [_cells(s) for s in scores])
-    metrics = [(name, readable(value)) for name, value in _numbers(record.get("metrics") or {})]
+    kept = record.get("validation")
+    metrics = [(name, readable(value)) for name, value in _numbers(kept or record.get("metrics") or {})]
     if metrics:
-        yield "On its own, by its trainer's last evaluation:"
+        which = "the evaluation for which it was kept" if kept else "its trainer's last evaluation"
+        yield f"On its own, by {which}:"
         yield _table(("metric", "value"), metrics)
     if not scores and not metrics:
         yield "Not measured yet with these weights."

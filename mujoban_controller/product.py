@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from torch import Tensor
 
@@ -19,6 +19,8 @@ from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import VALIDATION_SEEDS
 
 BatchT = TypeVar("BatchT")
+_RATES: Final = ("success_rate", "success_rate/feasible")
+"""Names of what products are compared by."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,9 @@ class ProductLearner(Learner[BatchT]):
         self._validation = validation
         self._best_score: tuple[float, float] | None = None
         self._best_weights: dict[str, Tensor] = {}
+        self._best_scalars: dict[str, float] = {}
+        self._best_at: int | None = None
+        self._evaluations = 0
 
     @property
     @abstractmethod
@@ -61,7 +66,9 @@ class ProductLearner(Learner[BatchT]):
     def state(self) -> State:
         """Return what changes beside modules and optimisers."""
         score = None if self._best_score is None else list(self._best_score)
-        return State.of({"own": self.own_state(), "best": State({"score": score}, self._best_weights)})
+        found = {"scalars": self._best_scalars, "at": self._best_at, "evaluations": self._evaluations}
+        best = State({"score": score, **found}, self._best_weights)
+        return State.of({"own": self.own_state(), "best": best})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
@@ -73,6 +80,9 @@ class ProductLearner(Learner[BatchT]):
         score = state.values["score"]
         self._best_weights = state.tensors
         self._best_score = None if score is None else tuple(score)
+        # Runs that were begun earlier know the rates alone.
+        self._best_scalars = state.values.get("scalars") or dict(zip(_RATES, score or (), strict=False))
+        self._best_at, self._evaluations = state.values.get("at"), state.values.get("evaluations", 1)
 
     def evaluate(self) -> Scalars:
         """Return how many validation levels the product solves under a solver's plans; keep it if it is the best."""
@@ -88,19 +98,23 @@ class ProductLearner(Learner[BatchT]):
         product.train(training)
         feasible = report["instructions"]["feasible"]
         score = (report["success_rate"], feasible["completed"] / max(feasible["n"], 1))
-        if self._best_score is None or score >= self._best_score:
-            self._best_score = score
-            self._best_weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
         kinds = report["instructions"]["kinds"]
         medians = {f"steps/{k}": v["median_steps"] for k, v in kinds.items() if v["median_steps"] is not None}
-        return {"success_rate": score[0], "success_rate/feasible": score[1], "steps": report["median_steps"], **medians}
+        scalars = {**dict(zip(_RATES, score, strict=True)), "steps": report["median_steps"], **medians}
+        if self._best_score is None or score >= self._best_score:
+            self._best_score, self._best_scalars, self._best_at = score, scalars, self._evaluations
+            self._best_weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
+        self._evaluations += 1
+        return scalars
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the best product, or the present one where none was judged."""
+        """Write the best product, or the present one where none was judged.
+
+        The record says under `validation` what the best one solved, and under `evaluation` in which evaluation: in the
+        first, 0, of a run that began with an evaluation, training has improved nothing.
+        """
         product = self.product
         chosen = type(product)(**product.config)
         chosen.load_state_dict(self._best_weights or product.state_dict())
-        score = self._best_score
-        best = None if score is None else {"success_rate": score[0], "success_rate/feasible": score[1]}
-        path = directory.path / f"{product.file_name}.safetensors"
-        save_weights(path, chosen, product.config, {**record, "validation": best})
+        told = {"validation": self._best_scalars or None, "evaluation": self._best_at}
+        save_weights(directory.path / f"{product.file_name}.safetensors", chosen, product.config, {**record, **told})

@@ -204,6 +204,8 @@ class OracleController(Controller):
     """A scripted driver that knows where everything is: turn, drive along the lane, reverse to recentre."""
 
     privileged = True
+    config: Final = {"body": BALL.name}
+    """The script drives no other body."""
 
     def __init__(self, gains: DrivingGains | None = None) -> None:
         """Drive the ball body with the given gains."""

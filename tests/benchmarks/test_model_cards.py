@@ -60,6 +60,11 @@ def test_every_network_that_a_trainer_of_planners_makes_has_a_card(network):
         ("VisuomotorController", {"teacher": "a" * 64, "training": {"stage": "distil"}}, "by a teacher that knows"),
         ("VisuomotorController", {"teacher": "scripted driver", "training": {"stage": "distil"}}, "scripted driver"),
         ("VisuomotorController", {"teacher": None, "training": {"stage": "mpo"}}, "by reward"),
+        ("VisuomotorController", {"initial": "b" * 64, "training": {"stage": "mpo"}}, "own play; then by reward"),
+        (
+            "VisuomotorController", {"initial": "b" * 64, "training": {"stage": "mpo"}, "evaluation": 0},
+            "which solved no more levels: the weights from before were kept",
+        ),
         ("ThinkingPlanner", {"method": "expert-iteration then ppo over pushes"}, "solver; then by reward, over pushes"),
         ("Explorer", {"method": "mpo, reward for cells that come into view"}, "by reward, for cells seen"),
     ],

@@ -28,7 +28,7 @@ from mujoban_rl.engine import Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.run_directory import RunDirectory, RunError
 from mujoban_rl.testing import check_refusal, check_resuming
-from mujoban_rl.weights import WeightsError, load_weights, save_weights
+from mujoban_rl.weights import WeightsError, load_weights, read_record, save_weights
 from mujoban_sim.goals import GoalKind
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
@@ -168,6 +168,8 @@ def test_the_best_product_on_validation_levels_is_exported(teacher, tmp_path):
     assert learner.evaluate() == first
     learner.export(RunDirectory(tmp_path, {**asdict(STAGES["ppo"]), "steps": 64}), {})
     assert float(load_weights(PrivilegedPolicy, tmp_path / "teacher.safetensors").log_scale.detach().max()) == 0.0
+    record = read_record(tmp_path / "teacher.safetensors")
+    assert record["validation"] == first and record["evaluation"] == 0
 
 
 def test_a_number_of_validation_levels_below_none_is_refused(tmp_path):

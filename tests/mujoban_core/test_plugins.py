@@ -37,5 +37,7 @@ def test_a_body_plays_with_the_weights_that_ship_for_it(tmp_path, monkeypatch):
     played = Stack(body="ant").choices
     assert played["controller"].weights == tmp_path / "controller_ant.safetensors"
     assert played["planner"].weights is None
-    for own in (Choice("controller", weights=tmp_path / "mine.safetensors"), Choice("controller", ORACLE)):
-        assert Stack({"controller": own}, body="ant").choices == {"controller": own}
+    own = Choice("controller", weights=tmp_path / "mine.safetensors")
+    assert Stack({"controller": own}, body="ant").choices == {"controller": own}
+    driver = Stack({"controller": Choice("controller", ORACLE)}, body="ant").choices["controller"]
+    assert driver.weights == mujoban_controller.teacher_weights("ant"), "the script drives the ball alone"
