@@ -120,8 +120,10 @@ class Stack:
         body = get_body(self.body)
         if self.choices["estimator"].source != ORACLE:
             return body.look_ticks
+        if not body.seeking_ticks:
+            return 0
         controller = self.choices["controller"]
-        seeing = controller.source != ORACLE and body.seeking_ticks and not controller.load().privileged
+        seeing = controller.source != ORACLE and not controller.load().privileged
         return body.seeking_ticks if seeing else 0
 
     def policy(self) -> SensePlanAct:

@@ -64,8 +64,8 @@ def test_a_seed_is_an_episode_and_without_one_no_test_level_is_played():
 class Lowest:
     """A generator that draws the lowest number of each range."""
 
-    def integers(self, low, high):
-        return low
+    def integers(self, low, high, count):
+        return np.full(count, low)
 
 
 def test_seeds_are_drawn_beyond_those_of_validation_and_tests():
