@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_core.ranges import check_positive
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import start_from
@@ -71,17 +72,20 @@ class ImitationConfig(LessonConfig, LearnerConfig):
     """What defines an imitation run."""
 
     horizon_seconds: float = 1e9
-    """Training time at which the cosine schedule ends, whichever of the two horizons comes first."""
+    """Training time at which the cosine schedule ends, whichever of this and the next two comes first."""
     horizon_samples: float = 4e6
     """Samples at which the cosine schedule ends."""
+    cpu_seconds: float = 1e9
+    """CPU seconds of all processes at which the cosine schedule ends."""
     bag_share: float = 0.25
     """Share of a batch that comes from bags, where there are any; 1: all, and no lesson is made."""
     bag_estimates: float = 0.8
     """Share of these decisions that are shown as they were estimated, the others as they were."""
 
     def __post_init__(self) -> None:
-        """Reject what is no share, and levels that are hardly found."""
+        """Reject what is no share, a budget of nothing, and levels that are hardly found."""
         super().__post_init__()
+        check_positive(self, "cpu_seconds")
         if not 0.0 < self.bag_share <= 1.0:
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
         if not 0.0 <= self.long <= 1.0:
@@ -227,7 +231,7 @@ def imitation(
         "bags": [bag.name for bag in bags],
         "bags_digest": bags_digest(bags),
     }
-    budget = Budget(samples=config.horizon_samples, seconds=config.horizon_seconds)
+    budget = Budget(config.horizon_samples, seconds=config.horizon_seconds, cpu_seconds=config.cpu_seconds)
     return Trainer(run, learner, source, budget, cadence, record=record)
 
 

@@ -19,6 +19,7 @@ from torch import nn
 
 from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
+from mujoban_core.ranges import check_positive
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch, StepStore
@@ -39,11 +40,21 @@ class MPOConfig(PlayConfig, NetworkConfig):
 
     bag_share: float = 0.25
     """Share of a batch that comes from bags, where there are any; 1: all, and nothing is played."""
+    cpu_seconds: float = 1e9
+    """CPU seconds of all processes after which the run is complete."""
 
     def __post_init__(self) -> None:
-        """Reject what is no share."""
+        """Reject what is no share, and a budget of nothing."""
+        check_positive(self, "cpu_seconds")
         if not 0.0 < self.bag_share <= 1.0:
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
+
+
+@dataclass(frozen=True)
+class _Run(MPOConfig):
+    """A configuration with what the run began with, as its directory keeps it."""
+
+    init: dict[str, str] | None = None
 
 
 class MoveStore(StepStore):
@@ -149,7 +160,7 @@ def reinforcement(
         ValueError: If the directory belongs to another run, or a bag is not what is expected.
     """
     origin = {"path": init_path.name, "digest": digest(init_path)} if init_path else None
-    run = RunDirectory(directory, asdict(config) | {"init": origin})
+    run = RunDirectory(directory, _Run(**vars(config), init=origin))
     recorded = BagTransitions.read(bags) if bags else None
     learner = MPOLearner(config, device=device, init=init)
     if recorded is not None and config.bag_share == 1.0:
@@ -165,7 +176,7 @@ def reinforcement(
         "data": lineage(data, init_path),
         "bags_digest": bags_digest(bags),
     }
-    return Trainer(run, learner, source, Budget(), cadence, record=record)
+    return Trainer(run, learner, source, Budget(cpu_seconds=config.cpu_seconds), cadence, record=record)
 
 
 def _played(

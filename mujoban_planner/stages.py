@@ -6,15 +6,22 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import torch
+
 from mujoban_core.files import write_atomically
+from mujoban_core.ranges import check_counts, check_positive
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
+from mujoban_planner.growth import start_from
 from mujoban_planner.imitation import ImitationConfig, imitation
+from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
+from mujoban_planner.reinforcement import MPOConfig, reinforcement
+from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence, Trainer
 from mujoban_rl.limits import TimeLimit
@@ -32,50 +39,100 @@ class _Place(NamedTuple):
     run: Path
     cadence: Cadence
     actors: ActorOptions
+    device: str
 
 
 class _Settings(NamedTuple):
     """What all methods are told."""
 
-    channels: int
-    blocks: int
+    network: NetworkConfig
     init: str | None
     seed: int
     cpu_seconds: float
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """All of it, as options of a method's configuration."""
+        return asdict(self.network) | {"init": self.init, "seed": self.seed, "cpu_seconds": self.cpu_seconds}
+
+
+def _expert_iteration(settings: _Settings, place: _Place) -> Trainer[Any]:
+    config = ExpertIterationConfig(**settings.options)
+    return expert_iteration(config, place.run, place.cadence, place.actors, device=place.device)
+
 
 def _imitation(settings: _Settings, place: _Place) -> Trainer[Any]:
-    common = settings._asdict()
-    # Its budget is wall-clock: lessons are made in a process beside.
-    horizon = common.pop("cpu_seconds") / 2.0
-    config = ImitationConfig(**common, horizon_seconds=horizon, horizon_samples=1e12)
-    return imitation(config, place.run, place.cadence, actors=ActorOptions("processes"))
+    config = ImitationConfig(**settings.options, horizon_samples=1e12)
+    return imitation(config, place.run, place.cadence, device=place.device, actors=place.actors)
+
+
+def _mpo(settings: _Settings, place: _Place) -> Trainer[Any]:
+    options = settings.options
+    init = options.pop("init")
+    path = None if init is None else Path(init)
+    torch.manual_seed(settings.seed)  # the weights that the network has beyond those that it starts from
+    return reinforcement(
+        MPOConfig(**options),
+        place.run,
+        replace(place.cadence, log_updates=50, publish_updates=5),  # as of a run of its own
+        device=place.device,
+        actors=place.actors,
+        init=None if path is None else _started(settings.network, path),
+        init_path=path,
+    )
+
+
+def _mpo_pushes(settings: _Settings, place: _Place) -> Trainer[Any]:
+    return push_mpo(PushMPOConfig(**settings.options), place.run, place.cadence, place.actors)
+
+
+def _ppo(settings: _Settings, place: _Place) -> Trainer[Any]:
+    # Each rollout is to be played by the newest policy.
+    cadence = replace(place.cadence, publish_updates=1)
+    return push_ppo(PushPPOConfig(**settings.options), place.run, cadence, place.actors)
+
+
+def _started(config: NetworkConfig, weights: Path) -> LearnedPlanner:
+    """Return a network that starts from weights.
+
+    Raises:
+        WeightsError: If they are missing or damaged, or do not fit into the network.
+    """
+    network = config.build()
+    start_from(network, weights)
+    network.lay_out()
+    return network
 
 
 METHODS: Final[Mapping[str, Callable[[_Settings, _Place], Trainer[Any]]]] = {
-    "expert-iteration": lambda settings, place: expert_iteration(ExpertIterationConfig(**settings._asdict()), *place),
+    "expert-iteration": _expert_iteration,
     "imitation": _imitation,
-    "mpo-pushes": lambda settings, place: push_mpo(PushMPOConfig(**settings._asdict()), *place),
-    "ppo": lambda settings, place: push_ppo(PushPPOConfig(**settings._asdict()), *place),
+    "mpo": _mpo,
+    "mpo-pushes": _mpo_pushes,
+    "ppo": _ppo,
 }
 
 
 @dataclass(frozen=True)
-class StagesConfig:
+class StagesConfig(NetworkConfig):
     """What defines a run of several methods."""
 
-    stages: tuple[str, ...] = ("expert-iteration=0.7", "mpo-pushes=0.3")
-    """Methods in their order, each with its share of the time: expert-iteration, imitation, mpo-pushes, ppo."""
-    cpu_seconds: float = 10_800.0
-    """CPU seconds of all together."""
     channels: int = 48
     """Channels of the network."""
     blocks: int = 6
-    """Residual blocks."""
+    """Residual blocks (residual, thinking)."""
+    stages: tuple[str, ...] = ("expert-iteration=0.7", "mpo-pushes=0.3")
+    """Methods in their order, each with its share of the time: expert-iteration, imitation, mpo, mpo-pushes, ppo."""
+    init: str | None = None
+    """Weights that the first stage starts from: of the same or fewer channels and blocks."""
+    cpu_seconds: float = 10_800.0
+    """CPU seconds of all together."""
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Reject what is no method or no share."""
+        """Reject networks of nothing, budgets of nothing, and what is no method or no share."""
+        check_counts(self, "channels", "blocks")
+        check_positive(self, "cpu_seconds")
         _ = self.parsed
 
     @property
@@ -102,7 +159,13 @@ class StagesConfig:
 
 
 def train_stages(
-    config: StagesConfig, directory: Path, cadence: Cadence, actors: ActorOptions, seconds: float | None = None
+    config: StagesConfig,
+    directory: Path,
+    cadence: Cadence,
+    actors: ActorOptions,
+    seconds: float | None = None,
+    *,
+    device: str = "cpu",
 ) -> bool:
     """Run, or go on with, all stages, each in a folder of its own; return whether all are complete.
 
@@ -110,20 +173,24 @@ def train_stages(
         config: What to train; fixed for the run.
         directory: Run directory; the planner of the last stage is copied there.
         cadence: How often stages evaluate and save.
-        actors: Where levels are searched or played.
+        actors: Where levels are searched or played, and lessons made.
         seconds: Wall-clock of this bit of the run.
+        device: Device of the networks, in the methods that may have another than the CPU: all but those over pushes.
 
     Raises:
         RunError: If the directory belongs to another run.
+        WeightsError: If the weights to start from are missing or damaged, or do not fit into the network.
     """
+    if config.init is not None:
+        _started(config.network, Path(config.init))  # fails before anything is written, if it does
     RunDirectory(directory, config)
-    time, init = TimeLimit(seconds), None
+    time, init = TimeLimit(seconds), config.init
     folders = []
     for i, (method, share) in enumerate(config.parsed, 1):
         folders.append(directory / f"{i}_{method}")
         seed = len(config.parsed) * config.seed + i - 1  # each stage has levels of its own
-        settings = _Settings(config.channels, config.blocks, init, seed, share * config.cpu_seconds)
-        trainer = METHODS[method](settings, _Place(folders[-1], cadence, actors))
+        settings = _Settings(config.network, init, seed, share * config.cpu_seconds)
+        trainer = METHODS[method](settings, _Place(folders[-1], cadence, actors, device))
         product = folders[-1] / _PRODUCT
         if trainer.complete and product.exists():
             trainer.source.close()

@@ -10,6 +10,7 @@ if __name__ == "__main__":
 
     end_at_once()
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -43,6 +44,8 @@ class _Command(ABC):
     """Stop after so many seconds; a later call resumes."""
     evaluate_every: float = 300.0
     """Seconds between evaluations on held-out levels."""
+    evaluate_samples: float = math.inf
+    """Samples between evaluations, beside those by seconds; the first is then of what the run begins with."""
     save_every: float = 120.0
     """Seconds between checkpoints."""
     threads: int = 1
@@ -55,8 +58,9 @@ class _Command(ABC):
     def cadence(self, *, log_updates: int = 100, publish_updates: int = 10) -> Cadence:
         """Return how often the run logs, publishes, evaluates and saves."""
         return Cadence(
-            log_updates, publish_updates, evaluate_seconds=self.evaluate_every, save_seconds=self.save_every
-        )
+            log_updates, publish_updates, self.evaluate_samples, self.evaluate_every, self.save_every,
+            evaluate_first=math.isfinite(self.evaluate_samples),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -165,11 +169,13 @@ class Stages(_ActorCommand):
 
     run: Path = Path("runs/planner_stages")
     """Run directory, with a folder for each stage; an existing one is resumed."""
+    device: str = "cpu"
+    """Device of the networks; PPO and MPO over pushes compute on the CPU all the same."""
     config: tyro.conf.OmitArgPrefixes[StagesConfig] = field(default_factory=StagesConfig)
 
     def main(self) -> None:
         """Train."""
-        train_stages(self.config, self.run, self.cadence(), self.actors, self.seconds)
+        train_stages(self.config, self.run, self.cadence(), self.actors, self.seconds, device=self.device)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from mujoban_core.files import digest
-from mujoban_planner import stages
+from mujoban_core.grid import GRID_SIZE
+from mujoban_planner import load, stages, train
 from mujoban_planner.push_actor import PlayConfig
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
@@ -21,10 +22,10 @@ from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence, Trainer
 from mujoban_rl.run_directory import RunError
-from mujoban_rl.weights import save_weights
+from mujoban_rl.weights import WeightsError, save_weights
 
 PLAY = PlayConfig(environments=8, steps=4)
-CONFIG = StagesConfig(("ppo=1", "mpo-pushes=3"), cpu_seconds=8e9, channels=8, blocks=1, seed=3)
+CONFIG = StagesConfig(stages=("ppo=1", "mpo-pushes=3"), cpu_seconds=8e9, channels=8, blocks=1, seed=3)
 OFTEN = Cadence(publish_updates=1, save_seconds=math.inf)
 
 
@@ -36,7 +37,8 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     def tiny(kind: Any, make: Any, **size: Any) -> Any:
         def method(settings: Any, place: Any) -> Trainer[Any]:
             told.append(settings)
-            trainer = make(kind(**settings._asdict(), play=PLAY, updates=3, **size), *place)
+            config = kind(**settings.options, play=PLAY, updates=3, **size)
+            trainer = make(config, place.run, place.cadence, place.actors)
             trainer.learner.evaluate = dict
             return trainer
 
@@ -79,10 +81,89 @@ def test_a_run_goes_on_with_the_stage_that_was_stopped(tmp_path: Path, started: 
     assert train_stages(CONFIG, tmp_path, OFTEN, ActorOptions())
     assert digest(tmp_path / "1_ppo" / "planner.safetensors") == first
     with pytest.raises(RunError):
-        train_stages(StagesConfig(("ppo=1",)), tmp_path, OFTEN, ActorOptions())
+        train_stages(StagesConfig(stages=("ppo=1",)), tmp_path, OFTEN, ActorOptions())
+
+
+def small_planner(path: Path, *, blocks: int = 2) -> Path:
+    """Write weights that say something else for every board."""
+    network = NetworkConfig("thinking", channels=8, blocks=blocks, tied=1).build()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, 0.0, 0.1)
+    save_weights(path, network, network.config, {"data": "a test"})
+    return path
+
+
+@pytest.mark.parametrize("method", sorted(stages.METHODS))
+def test_every_method_goes_on_with_a_planner_that_thinks(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
+    start = small_planner(tmp_path / "start.safetensors")
+    where = ["--run", str(tmp_path / "run"), "--init", str(start), "--stages", f"{method}=1", "--seconds", "0"]
+    network = ["--architecture", "thinking", "--channels", "8", "--blocks", "3", "--tied", "1"]
+    assert train.main(["stages", *where, *network]) == 0
+    product = tmp_path / "run" / f"1_{method}" / "planner.safetensors"
+    before, after = load(start, compiled=False), load(product, compiled=False)
+    assert type(after) is type(before) and after.config["blocks"] == 3
+    states = torch.rand(4, GRID_SIZE, GRID_SIZE, 4)
+    with torch.no_grad():
+        said, says = before(states), after(states)
+    for name in ("push", "push_dead", "plan", "q"):
+        assert torch.allclose(getattr(said, name), getattr(says, name), atol=1e-4), name
+    assert json.loads(product.with_suffix(".json").read_text())["data"].startswith("a test; then ")
+
+
+def test_weights_that_do_not_fit_are_named_before_anything_is_written(tmp_path: Path) -> None:
+    start = small_planner(tmp_path / "start.safetensors", blocks=4)
+    config = StagesConfig("thinking", channels=8, blocks=3, tied=1, init=str(start))
+    with pytest.raises(WeightsError, match=r"start.safetensors: a ThinkingPlanner .* expected .* with at most"):
+        train_stages(config, tmp_path / "run", OFTEN, ActorOptions())
+    assert not (tmp_path / "run").exists()
+
+
+def what_is_told(method: str, made: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Return all that the trainer of a method is made of, as the first of two stages with a quarter of the time."""
+    told: list[Any] = []
+
+    class Told(Exception):
+        pass
+
+    def note(*arguments: Any, **options: Any) -> None:
+        told.extend([*arguments, *options.values()])
+        raise Told
+
+    monkeypatch.setattr(stages, made, note)
+    config = StagesConfig(stages=(f"{method}=1", "ppo=3"), cpu_seconds=400.0)
+    with pytest.raises(Told):
+        train_stages(config, folder, Cadence(), ActorOptions("threads", 3), device="cuda")
+    return told
+
+
+MADE = {"imitation": "imitation", "mpo": "reinforcement", "expert-iteration": "expert_iteration"}
+
+
+@pytest.mark.parametrize("method", sorted(MADE))
+def test_methods_get_the_actors_the_device_and_their_share_of_the_cpu_seconds(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = what_is_told(method, MADE[method], tmp_path, monkeypatch)
+    assert ActorOptions("threads", 3) in told and "cuda" in told and told[0].cpu_seconds == 100.0
+
+
+def test_each_rollout_of_ppo_is_played_by_the_newest_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = what_is_told("ppo", "push_ppo", tmp_path, monkeypatch)
+    assert Cadence(publish_updates=1) in told and told[0].cpu_seconds == 100.0
+
+
+def test_a_run_from_before_there_were_other_networks_goes_on(tmp_path: Path, started: list[Any]) -> None:
+    assert not train_stages(CONFIG, tmp_path, OFTEN, ActorOptions(), seconds=0.0)
+    file = tmp_path / "config.json"
+    known = ("stages", "cpu_seconds", "channels", "blocks", "seed")
+    file.write_text(json.dumps({name: json.loads(file.read_text())[name] for name in known}))
+    assert train_stages(CONFIG, tmp_path, OFTEN, ActorOptions())
 
 
 @pytest.mark.parametrize("text", ["ppo", "ppo=0", "ppo=nan", "dqn=1", "=1"])
 def test_bad_stages_are_named(text: str) -> None:
     with pytest.raises(ValueError, match=r"--stages .*: expected METHOD=SHARE with a method among"):
-        StagesConfig((text,))
+        StagesConfig(stages=(text,))

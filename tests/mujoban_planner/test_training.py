@@ -1,5 +1,6 @@
 import json
 import math
+import re
 from functools import partial
 from types import SimpleNamespace
 
@@ -18,6 +19,7 @@ from mujoban_msgs_py.bags.training import EpisodeTick
 from mujoban_msgs_py.conversions import InstructionReading
 from mujoban_planner import bag_transitions, train
 from mujoban_planner.boards import abstract_states
+from mujoban_planner.curves import read_curve
 from mujoban_planner.decision import count_visits, initial_means, initial_visits
 from mujoban_planner.growth import start_from
 from mujoban_planner.imitation import ImitationConfig, imitation, imitation_loss
@@ -29,6 +31,7 @@ from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
+from mujoban_rl.run_directory import RunError
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import WeightsError, save_weights
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
@@ -132,9 +135,11 @@ def test_hidden_states_show_what_was_in_view_and_guess_the_rest():
     assert torch.equal(some[: len(truth) - half], truth[: len(truth) - half])
 
 
-def _mpo(path, **changes):
+def _mpo(path, start=None, **changes):
     small = {"environments": 8, "batch_size": 8, "warm_up_steps": 8, "replay_steps": 50, "play": 3, "n_step": 2}
-    return reinforcement(MPOConfig(channels=8, blocks=1, failure_rate=0.1, **small | changes), path)
+    config = MPOConfig(channels=8, blocks=1, failure_rate=0.1, **small | changes)
+    network = None if start is None else mujoban_planner.load(start, compiled=False)
+    return reinforcement(config, path, init=network, init_path=start)
 
 
 def test_mpo_writes_a_loadable_planner(tmp_path):
@@ -231,6 +236,55 @@ def test_bad_training_input_ends_with_one_line_and_status_2(tmp_path, capsys):
     assert exit_status("train", partial(train.main, arguments)) == 2
     error = capsys.readouterr().err.strip()
     assert "another configuration" in error and len(error.splitlines()) == 1
+
+
+def _imitate_from(path, start=None, **changes):
+    return _imitation(path, init=None if start is None else str(start), **changes)
+
+
+@pytest.mark.parametrize("make", [_imitate_from, _mpo])
+def test_a_run_is_complete_when_its_cpu_seconds_are_spent(make, tmp_path):
+    trainer = make(tmp_path, cpu_seconds=1e-6)
+    assert trainer.run() and trainer.progress.updates == 1
+
+
+@pytest.mark.parametrize("make", [_imitate_from, _mpo])
+@pytest.mark.parametrize("begun", [True, False])
+def test_a_run_from_before_there_were_cpu_seconds_goes_on(make, begun, tmp_path):
+    start = None
+    if begun:
+        network, start = ResidualPlanner(8, 1, judge=True), tmp_path / "start.safetensors"
+        save_weights(start, network, network.config, {})
+    make(tmp_path / "run", start).run(limit_updates=2)
+    file = tmp_path / "run" / "config.json"
+    stored = json.loads(file.read_text())
+    del stored["cpu_seconds"]
+    file.write_text(json.dumps(stored))
+    assert make(tmp_path / "run", start).progress.updates == 2
+    with pytest.raises(RunError, match=r"cpu_seconds: 1000000000.0 there, 5.0 now"):
+        make(tmp_path / "run", start, cpu_seconds=5.0)
+
+
+def test_evaluations_by_samples_begin_before_training(tmp_path):
+    small = ["--channels", "8", "--blocks", "1", "--batch-size", "16", "--levels", "16", "--stock", "4"]
+    often = ["--actors", "local", "--evaluate-samples", "32", "--samples", "80"]
+    assert train.main(["imitation", "--run", str(tmp_path), *small, *often]) == 0
+    assert [samples for samples, *_ in read_curve(tmp_path, 1)] == [0, 32, 64, 80]
+
+
+@pytest.mark.parametrize("method", ["imitation", "expert-iteration", "ppo", "mpo", "mpo-pushes", "stages", "explorer"])
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("--cpu-seconds", r"(cpu_seconds is 0.0|budget of 0.0 cpu_seconds): expected a"),
+        ("--evaluate-samples", "evaluate every 0.0 samples: expected a positive number"),
+    ],
+)
+def test_every_method_has_a_budget_of_cpu_seconds_and_evaluations_by_samples(tmp_path, capsys, method, option, said):
+    arguments = [method, "--run", str(tmp_path / "run"), option, "0"]
+    assert exit_status("train", partial(train.main, arguments)) == 2
+    error = capsys.readouterr().err.strip()
+    assert re.search(said, error) and len(error.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
