@@ -16,7 +16,7 @@ if __name__ == "__main__":
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -195,7 +195,7 @@ def make_trainer(
         data: What it learns from beside what `config` says, for the record.
         start: Digest of the weights that it starts from, or of each of them by name, for the record.
     """
-    directory = RunDirectory(run, {**asdict(config), "method": method})
+    directory = RunDirectory(run, config, beside={"method": method})
     record = {
         **provenance(),
         "training": directory.config,

@@ -48,7 +48,9 @@ class RunDirectory:
     is whole or is ignored. The last `keep` survive.
     """
 
-    def __init__(self, path: str | Path, config: Any, *, keep: int = 2) -> None:
+    def __init__(
+        self, path: str | Path, config: Any, *, beside: Mapping[str, Any] | None = None, keep: int = 2
+    ) -> None:
         """Create the directory, or reopen it when its configuration is the same.
 
         One in which nothing has been done yet takes a new configuration: a start that failed, for instance at a file
@@ -58,6 +60,7 @@ class RunDirectory:
             path: Directory; an existing one is resumed.
             config: Dataclass or mapping; what must not change between the bits of a run. Options that have come since
                 it began have to be at their defaults.
+            beside: JSON values that must not change either and are no options: a method, what the run began with.
             keep: Number of checkpoints kept.
 
         Raises:
@@ -65,7 +68,7 @@ class RunDirectory:
         """
         self.path = Path(path)
         self.keep = keep
-        self.config = _as_json(config)
+        self.config = _as_json(config) | _as_json(beside or {})
         self.path.mkdir(parents=True, exist_ok=True)
         file = self.path / _CONFIG
         if file.exists() and any(other != file for other in self.path.iterdir()):

@@ -73,6 +73,14 @@ def test_a_run_from_before_an_option_came_goes_on_while_that_is_at_its_default(t
             RunDirectory(tmp_path, other)
 
 
+def test_what_stands_beside_the_options_must_not_change_either(tmp_path):
+    RunDirectory(tmp_path, {"steps": 3, "method": "MPO"})
+    (tmp_path / "metrics.jsonl").touch()
+    assert RunDirectory(tmp_path, _Config(3), beside={"method": "MPO"}).config["method"] == "MPO"
+    with pytest.raises(RunError, match="method: 'MPO' there, 'PPO' now"):
+        RunDirectory(tmp_path, _Config(3), beside={"method": "PPO"})
+
+
 @pytest.mark.parametrize("part", ["safetensors", "json"])
 def test_a_checkpoint_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path, monkeypatch, part):
     net, adam = _make()
