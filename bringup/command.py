@@ -13,6 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mujoban_core.agent import Agent, AgentPolicy, beyond_senses
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.look_around import look_around
 from mujoban_core.plugins import (
@@ -24,6 +25,7 @@ from mujoban_core.plugins import (
     SCOUT,
     SCRIPTED,
     check_body,
+    check_told,
     chosen_weights,
     load_module,
     load_scout,
@@ -32,7 +34,6 @@ from mujoban_core.plugins import (
 from mujoban_planner.deliberation import Deliberation
 
 if TYPE_CHECKING:
-    from mujoban_core.agent import AgentPolicy
     from mujoban_core.interfaces import Module
     from mujoban_core.sense_plan_act import SensePlanAct
 
@@ -66,6 +67,27 @@ class Choice:
         """
         return load_module(self.role, self.source, self.weights, device)
 
+    @cached_property
+    def told(self) -> bool | None:
+        """Whether it asks for the ground truth, as reports say; None of an oracle, whose name says so in any case.
+
+        An instance made for it is asked, once; what plays is held to the answer, see `check_told`.
+
+        Raises:
+            ValueError: See `load`.
+        """
+        if self.source == ORACLE:
+            return None
+        # A scout is told the estimate alone, and what ships nothing else than the robot perceives.
+        if self.role == SCOUT or (self.source == LEARNED and self.weights is None):
+            return False
+        module = self.load()
+        return beyond_senses(module.sees) if isinstance(module, Agent) else bool(module.privileged)
+
+    def check(self, asks: bool) -> None:
+        """Raise a `ValueError` if an instance that is to play asks for the ground truth otherwise than reports say."""
+        check_told(self.role, self.source, asks, self.told)
+
     def identity(self) -> str:
         """Return the SHA-256 digest of the weights in use, or what stands in for a learned module.
 
@@ -73,20 +95,18 @@ class Choice:
 
         Raises:
             WeightsError: If the weights are missing.
+            ValueError: See `load`.
         """
         from mujoban_core.files import digest
         from mujoban_rl.weights import WeightsError
 
-        if self.source in (ORACLE, SCRIPTED) or (self.role == SCOUT and self.source != LEARNED):
-            return self.source
-        if self.source != LEARNED:
-            return f"{self.source}{PRIVILEGED}" if self.load().privileged else self.source
-        path = self.weights or shipped_weights(self.role)
-        if not path.is_file():
-            raise WeightsError(f"no weights of the {self.role} at {path}: expected a .safetensors file")
-        # A scout is told the estimate alone; of the others a teacher's weights may be told the truth.
-        privileged = self.role != SCOUT and self.weights is not None and self.load().privileged
-        return f"{digest(path)}{PRIVILEGED if privileged else ''}"
+        name = self.source
+        if self.source == LEARNED:
+            path = self.weights or shipped_weights(self.role)
+            if not path.is_file():
+                raise WeightsError(f"no weights of the {self.role} at {path}: expected a .safetensors file")
+            name = digest(path)
+        return f"{name}{PRIVILEGED if self.told else ''}"
 
 
 @dataclass(frozen=True)
@@ -122,16 +142,15 @@ class Stack:
             return body.look_ticks
         if not body.seeking_ticks:
             return 0
-        controller = self.choices["controller"]
-        seeing = controller.source != ORACLE and not controller.load().privileged
+        seeing = self.choices["controller"].told is False
         return body.seeking_ticks if seeing else 0
 
     def policy(self) -> SensePlanAct:
         """Return the modules composed into one policy.
 
         Raises:
-            ValueError: If a module cannot be loaded or is of another body, `look_around` is negative, or the planner
-                cannot think longer.
+            ValueError: If a module cannot be loaded, is of another body or asks for the ground truth otherwise than
+                `identities` says, `look_around` is negative, or the planner cannot think longer.
         """
         from mujoban_core.sense_plan_act import SensePlanAct
 
@@ -143,7 +162,10 @@ class Stack:
         scout = load_scout(self.scout.source, self.scout.weights, self.device) if ticks else None
         body = get_body(self.body)
         looking = {role: look_around(module, ticks, scout, body) for role, module in modules.items()}
-        return SensePlanAct(**looking)  # pyright: ignore
+        policy = SensePlanAct(**looking)  # pyright: ignore
+        for role, choice in self.choices.items():
+            choice.check(role in policy.told)
+        return policy
 
     def identities(self) -> dict[str, str]:
         """Return what identifies each module in a report, and what says where to look, if anything does."""
@@ -170,22 +192,19 @@ class Solo:
         """Return the agent as a policy.
 
         Raises:
-            ValueError: If it cannot be loaded or is of another body.
+            ValueError: If it cannot be loaded, is of another body or sees otherwise than `identities` says.
         """
         from typing import cast
 
-        from mujoban_core.agent import Agent, AgentPolicy
-
         agent = cast(Agent, self.choice.load(self.device))
         check_body(AGENT, agent, self.body)
-        return AgentPolicy(agent)
+        policy = AgentPolicy(agent)
+        self.choice.check(policy.privileged)
+        return policy
 
     def identities(self) -> dict[str, str]:
         """Return what identifies the agent in a report, and whether it sees what the robot cannot perceive."""
-        identity = self.choice.identity()
-        if self.choice.load().privileged and not identity.endswith(PRIVILEGED):
-            identity += PRIVILEGED
-        return {AGENT: identity}
+        return {AGENT: self.choice.identity()}
 
     def settings(self) -> dict[str, int | float]:
         """Return what a report says, beside `identities`, of how the agent plays: nothing."""

@@ -17,7 +17,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final, NamedTuple, Unpack
 
 import numpy as np
@@ -27,12 +26,13 @@ from mujoban_msgs.msg import AbstractState, EpisodeTruth, Instruction, Terminati
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
 
-from bringup.live_layout import CELL, ESTIMATE, TRUTH, Shown, arrow, blueprint, describe, text, torque_curves
+from bringup.live_layout import CELL, ESTIMATE, TRUTH, Shown, arrow, blueprint, describe, played, text, torque_curves
 from bringup.live_server import LiveServer
 from bringup.options import LOOPBACK
 from bringup.overlay import grid_picture
 from mujoban_core.grid import AGENT, CHANNELS
 from mujoban_core.grid import Instruction as Direction
+from mujoban_core.plugins import AGENT as ALONE
 from mujoban_core.plugins import ROLES
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
@@ -188,8 +188,8 @@ class LiveNode(GraphNode):
         for status in message.status:
             said = {value.key: value.value for value in status.values}
             role = status.name.rpartition("/")[2]
-            if role in ROLES and MODULE in said:
-                who = " ".join(filter(None, (said[MODULE], Path(said.get(WEIGHTS, "")).name)))
+            if role in (*ROLES, ALONE) and MODULE in said:
+                who = played(said[MODULE], said.get(WEIGHTS, ""))
                 self._shown = self._shown._replace(modules={**self._shown.modules, role: who})
 
     def _log_text(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from bringup.view import ARROWS
 from mujoban_core.bodies import BODIES
 from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_RC
 from mujoban_core.grid import Instruction as Direction
-from mujoban_core.plugins import ROLES, is_privileged
+from mujoban_core.plugins import AGENT, PRIVILEGED, ROLES, is_privileged
 
 CELL: Final = 16
 """Pixels along the edge of a cell of a map."""
@@ -56,6 +57,12 @@ class Shown(NamedTuple):
     """Role -> what plays it."""
 
 
+def played(module: str, weights: str) -> str:
+    """Return what plays a role by what its node says of module and weights, so that `is_privileged` tells it."""
+    name, mark, _ = module.partition(PRIVILEGED)
+    return " ".join(filter(None, (name, Path(weights).name))) + mark
+
+
 def text(shown: Shown) -> str:
     """Return the text, Markdown: the instruction with its arrow, the episode, and who plays."""
     heading, rows = "waiting for the graph", []
@@ -73,7 +80,7 @@ def text(shown: Shown) -> str:
             ("on target", f"{episode.boxes_on_target} of {boxes} boxes{', solved' if episode.solved else ''}"),
             ("return", f"{episode.episode_return:+.0f}"),
         ]
-    for role in ROLES:
+    for role in (AGENT,) if AGENT in shown.modules else ROLES:
         who = shown.modules.get(role, "not heard yet")
         rows.append((role, f"**{who}**" if is_privileged(who) else who))
     head, *others = rows

@@ -89,5 +89,6 @@ def _loaded(choice: Choice, player: Player) -> dict[str, Any]:
         "weights": "" if choice.weights is None else str(choice.weights),
         "body": player.body,
         "device": player.device,
+        "told": -1 if choice.told is None else int(choice.told),
         "threads": player.threads,
     }

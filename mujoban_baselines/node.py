@@ -8,15 +8,16 @@ if __name__ == "__main__":
     end_at_once()
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 from mujoban_msgs.msg import Episode
 
-from mujoban_core.agent import OWN_SENSES, Agent, AgentInput
+from mujoban_core.agent import OWN_SENSES, Agent, AgentInput, beyond_senses
 from mujoban_core.interfaces import GroundTruth, Module
 from mujoban_core.plugins import AGENT
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 
@@ -44,18 +45,30 @@ class AgentNode(ModuleNode[Agent]):
     @property
     def inputs(self) -> Sequence[Input]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What is read in every tick."""
-        return [_SIGHTS[name] for name in dict.fromkeys((*OWN_SENSES, *self.module.sees))]
+        return [_SIGHTS[name] for name in dict.fromkeys((*OWN_SENSES, *self._sees))]
+
+    def __init__(self, **options: Unpack[NodeOptions]) -> None:
+        """Load the agent and start listening."""
+        self._sees: tuple[str, ...] = ()
+        super().__init__(**options)
 
     def prepare(self, module: Module) -> Module:
         """Return the agent, unless it sees something else than the one before."""
-        before = getattr(self, "module", None)
-        if before is not None and isinstance(module, Agent) and module.sees != before.sees:
-            raise ValueError(f"the agent sees {', '.join(module.sees)}: expected {', '.join(before.sees)}, as before")
+        assert isinstance(module, Agent)  # `load_module` has checked it
+        # Asked once: what an agent says that it sees may change.
+        sees, before = tuple(module.sees), self._sees
+        if before and sees != before:
+            raise ValueError(f"the agent sees {', '.join(sees)}: expected {', '.join(before)}, as before")
+        self._sees = sees
         return module
+
+    def asks(self, module: Module) -> bool:
+        """Tell whether it sees more than the robot perceives, whatever it says itself."""
+        return beyond_senses(self._sees)
 
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
         """Act for one tick."""
-        seen = {name: inputs[_SIGHTS[name].topic.name][None] for name in self.module.sees}
+        seen = {name: inputs[_SIGHTS[name].topic.name][None] for name in self._sees}
         torque, self.state = self.module.step(AgentInput(**seen), self.state)
         return [Output(self._publisher, conversions.torque_to_msg(episode.header, torque[0]))]
 

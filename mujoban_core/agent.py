@@ -10,6 +10,7 @@ Shapes: B robots, N = `grid.GRID_SIZE`, P proprioceptive values, U actuators.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -49,6 +50,11 @@ OWN_SENSES: Final = ("frame", "proprio", "pose")
 """What the robot itself perceives (paper appendix B)."""
 
 
+def beyond_senses(sees: Iterable[str]) -> bool:
+    """Tell whether what is seen is more than the robot itself perceives."""
+    return not set(sees) <= set(OWN_SENSES)
+
+
 class Agent(Module):
     """(o_cam, o_pr, o_pos), or more, -> motor torques."""
 
@@ -58,7 +64,7 @@ class Agent(Module):
     @property
     def privileged(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether it sees what the robot itself cannot perceive."""
-        return not set(self.sees) <= set(OWN_SENSES)
+        return beyond_senses(self.sees)
 
     def initial_state(self, seeds: NDArray[np.int64]) -> Memory:
         """Return the state at the start of episodes with the given seeds of random streams, [B]."""
@@ -97,7 +103,8 @@ class AgentPolicy:
     def __post_init__(self) -> None:
         """Settle what it sees."""
         object.__setattr__(self, "sees", tuple(self.agent.sees))
-        object.__setattr__(self, "privileged", self.agent.privileged)
+        # By what it is shown: an agent's own word on it may be false.
+        object.__setattr__(self, "privileged", beyond_senses(self.sees))
 
     @property
     def cameras(self) -> tuple[str, ...]:

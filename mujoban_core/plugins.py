@@ -112,6 +112,29 @@ def _without_arguments(role: str, source: str, make: Callable[[], object]) -> ob
         raise PluginError(f"{source}: {error}, expected a {role} that is made without arguments") from error
 
 
+def check_told(role: str, source: str, asks: bool, told: bool | None) -> None:
+    """Raise a `PluginError` if what plays asks for the ground truth otherwise than a report says.
+
+    A report is written of one instance, and another may play: made by a node, on another machine, or again after a
+    crash. So whatever is about to play is held to what was said. That is the whole of the rule: an instance gets its
+    inputs, and the ground truth where it was named. Plugins are code and run with the user's rights; one that looks
+    through the interpreter (`gc`, frames), other processes or files, opens a node of its own, or makes the levels
+    itself from seeds that it guesses is for whoever names it to find out (docs/security.md).
+
+    Args:
+        role: Of `ROLES`, or `AGENT`.
+        source: What it was loaded from.
+        asks: Whether the instance that is to play asks for the ground truth.
+        told: Whether the report says so; None where it says so in any case.
+    """
+    if told is not None and asks != told:
+        asking, other = ("asks", "did not") if asks else ("does not ask", "did")
+        raise PluginError(
+            f"the {role} {source} {asking} for the ground truth where another instance {other}: expected all to be "
+            "alike, as reports name them"
+        )
+
+
 def is_privileged(identity: str) -> bool:
     """Tell from what a report calls a module whether it is told the ground truth."""
     return identity == ORACLE or identity.endswith(PRIVILEGED)

@@ -62,16 +62,20 @@ class SensePlanAct:
     planner: Planner
     controller: Controller
     told: frozenset[str] = field(init=False)
-    """Roles that get the ground truth: who calls itself privileged only later gets none, as no report would name it."""
+    """Roles that call themselves privileged: those of them that see get the ground truth, and reports name all.
+
+    Who does so only later gets none, as no report would name it.
+    """
 
     def __post_init__(self) -> None:
         """Settle who gets the ground truth."""
-        object.__setattr__(self, "told", frozenset(role for role in _SEEING if getattr(self, role).privileged))
+        asked = frozenset(role for role in (*_SEEING, "planner") if getattr(self, role).privileged)
+        object.__setattr__(self, "told", asked)
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras whose frames a module looks at; oracles go by the ground truth."""
-        return (FIRST_PERSON_CAMERA,) if self.told < set(_SEEING) else ()
+        return () if self.told.issuperset(_SEEING) else (FIRST_PERSON_CAMERA,)
 
     def initial_state(self, seeds: NDArray[np.int64]) -> PolicyState:
         """Return the state at the start of episodes with the given seeds, [B]."""

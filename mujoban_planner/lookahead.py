@@ -92,6 +92,7 @@ class LookAheadPlanner(Planner):
             )
         self.planner, self.expansions, self.per_tick, self.certainty = planner, expansions, per_tick, certainty
         self.deadline = deadline
+        self.privileged = planner.privileged
         self.thinks = per_tick is not None
         self._patience = 0 if per_tick is None else -(-expansions // per_tick)  # decisions that a search may take
         self.evaluations = 0

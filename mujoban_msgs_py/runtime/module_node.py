@@ -17,7 +17,7 @@ from rclpy.serialization import serialize_message
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.interfaces import GroundTruth, Module, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
-from mujoban_core.plugins import LEARNED, PRIVILEGED, check_body, chosen_weights, load_module
+from mujoban_core.plugins import LEARNED, PRIVILEGED, check_body, check_told, chosen_weights, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
@@ -30,6 +30,8 @@ MOST_TICKS = 1_000_000
 """Upper end of ranges of ticks, which have none of their own."""
 OWN_LOOK = -1
 """Stands for the ticks of a look that are the body's own."""
+AS_IT_ASKS = -1
+"""Says that a module is told the ground truth if it asks for it."""
 _PLACE, _ANSWER, _LEAF = "place", "answer", "state."
 """Keys of what a node keeps: the number of the episode and the stamp of the tick; its answer; arrays of the state."""
 TRUTH_INPUTS = (
@@ -56,6 +58,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
             without.
         body: The robot's body, of which the weights have to be; empty means any. Fixed when the node starts.
         device: Device of the learned module; setting it loads the weights again.
+        told: Whether the module is told the ground truth, 1 or 0, as reports of the run say: one that asks otherwise is
+            refused. -1: as it asks. Fixed when the node starts.
         threads: Threads of PyTorch in this process; at batch 1 further ones gain little on an idle machine, and on a
             busy one they wait for each other. Fixed when the node starts.
         run: Identifier of the run that the module answers; -1 for any. Fixed when the node starts.
@@ -75,7 +79,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         """Load the module and start listening.
 
         Raises:
-            ValueError: If the module or its weights cannot be loaded or are of another body, or `resume_file` is none.
+            ValueError: If the module or its weights cannot be loaded, are of another body, or ask for the ground truth
+                otherwise than `told` says; or `resume_file` is none.
         """
         super().__init__(self.role, **options)
         self.run = declare_run(self)
@@ -86,6 +91,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         whose = described("the robot's body, of which the weights have to be; empty: any", fixed=True)
         self._body = declare(self, "body", "", whose)
         device = declare(self, "device", "cpu", described("cpu or cuda, such as cuda:0"))
+        truth = described("whether it is told the ground truth, 1 or 0; -1: as it asks", fixed=True, low=-1, high=1)
+        told = declare(self, "told", AS_IT_ASKS, truth)
         seeds = described("seed of the module's random streams", fixed=True, low=0, high=2**31 - 1)
         self._run_seed = declare(self, "run_seed", 0, seeds)
         self._look_around = 0
@@ -98,7 +105,9 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         """What `step` of the module takes and returns; None before an episode."""
         self._episode = -1
         self.add_on_set_parameters_callback(self._on_parameters)
-        self._truth = self.truth_inputs if self.module.privileged else ()
+        self._told = self.asks(self.module)
+        check_told(self.role, self._source, self._told, None if told == AS_IT_ASKS else bool(told))
+        self._truth = self.truth_inputs if self._told else ()
         self._publisher = self.create_output(self.output)
         about = described("file of what the node remembers, to go on from after a crash; empty: none", fixed=True)
         resume_file = declare(self, "resume_file", "", about)
@@ -109,7 +118,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
 
     def _condition(self) -> Condition:
         condition = super()._condition()
-        which = f"{self._source}{PRIVILEGED if self.module.privileged else ''}"
+        which = f"{self._source}{PRIVILEGED if self._told else ''}"
         weights = self.get_parameter("weights").value
         return condition._replace(values={MODULE: which, WEIGHTS: weights, **condition.values})
 
@@ -172,6 +181,10 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         """What says where to look, for a planner that looks around."""
         return None
 
+    def asks(self, module: Module) -> bool:
+        """Tell whether a module that `prepare` has returned asks for the ground truth; asked once of each."""
+        return bool(module.privileged)
+
     def prepare(self, module: Module) -> Module:
         """Return the module that was loaded as this node wants it; a ValueError refuses it."""
         return module
@@ -184,7 +197,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         weights, device = (changed.get(name, value) for name, value in current.items())
         try:
             module = self._load(weights, device)
-            if module.privileged and self.truth_inputs and not self._truth:
+            if self.asks(module) and not self._told:
                 raise ValueError(f"weights {weights} need the ground truth: expected to be given when the node starts")
         except (ValueError, OSError, RuntimeError) as error:
             self.counts["refused weights"] += 1

@@ -1,6 +1,8 @@
 """Modules that try to cheat: a plugin for each role that collects whatever it can reach of the truth."""
 
+import sys
 import textwrap
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +11,18 @@ import yaml
 from mujoban_msgs.msg import EpisodeTruth
 from rich.console import Console
 
-from bringup.command import Choice, Stack
+from bringup.command import Choice, Solo, Stack
+from bringup.evaluate import evaluate
 from bringup.graph import Processes
 from bringup.monitor import Watched
 from bringup.parameters import graph_parameters
 from bringup.results import EpisodeResult, report
 from bringup.rollout import rollout
+from bringup.stack import PlayOptions, play
 from bringup.view import live_view
+from mujoban_core import plugins
 from mujoban_core.interfaces import module_seeds
-from mujoban_core.plugins import ROLES
+from mujoban_core.plugins import AGENT, ROLES
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.conversions import InstructionReading, TerminationReading
 from mujoban_msgs_py.runtime.module_node import ModuleNode
@@ -26,9 +31,14 @@ from mujoban_sokoban.episodes import Episodes
 
 CHEATERS = """
 import numpy as np
-from mujoban_core import interfaces
+from mujoban_core import agent, interfaces
 
-FOUND = {"seeds": [], "truth": [], "fields": set()}
+FOUND = {"seeds": [], "truth": [], "fields": set(), "behind": [], "kept": []}
+
+def behind(thing):
+    # What leads on from something that a module is given: fields, attributes, the memory of arrays.
+    names = (*getattr(thing, "_fields", ()), *getattr(thing, "__dict__", ()), "base", "obj")
+    return [value for value in (getattr(thing, name, None) for name in names) if value is not None]
 
 class Cheat:
     privileged = False
@@ -41,6 +51,17 @@ class Cheat:
         self.privileged = True  # too late
         FOUND["truth"].append(inputs.truth)
         FOUND["fields"].update(inputs._fields)
+        self.search(behind(inputs))
+    def search(self, values):
+        for value in values:
+            reached = [(value.nbytes, further) for further in behind(value)]
+            while reached:
+                own, thing = reached.pop()
+                FOUND["behind"].append((own, thing))
+                reached += [(own, further) for further in behind(thing)]
+            if value.flags.writeable:
+                value.fill(1)  # moves the robot, if this were the world's
+            FOUND["kept"].append((value, value.copy()))
 
 class Estimator(Cheat, interfaces.Estimator):
     def step(self, inputs, state):
@@ -55,6 +76,7 @@ class Termination(Cheat, interfaces.Termination):
 class Planner(Cheat, interfaces.Planner):
     def decide(self, abstract_state, memory):
         FOUND["truth"].append(abstract_state if abstract_state.any() else None)
+        self.search([abstract_state])
         return np.zeros(len(abstract_state), np.int64), memory
 
 class Controller(Cheat, interfaces.Controller):
@@ -64,6 +86,37 @@ class Controller(Cheat, interfaces.Controller):
 
 class Confessing(Planner):
     privileged = True
+
+class Shifty(Controller):
+    asks = []  # of each instance
+    def __init__(self):
+        self.privileged = self.asks.pop(0)
+
+class Flickering(Controller):
+    asked = 0
+    @property
+    def privileged(self):
+        self.asked += 1
+        return self.asked > 1
+    @privileged.setter
+    def privileged(self, value):
+        pass
+
+class Sly(agent.Agent):
+    privileged = False
+    sees = ("pose", "abstract_state")
+    def initial_memory(self, batch):
+        return ()
+    def step(self, inputs, state):
+        FOUND["truth"].append(inputs.abstract_state)
+        return np.zeros((len(inputs.pose), 2), np.float32), state
+
+class Growing(Sly):
+    looks = 0
+    @property
+    def sees(self):
+        self.looks += 1
+        return ("pose",) if self.looks == 1 else Sly.sees
 """
 PUBLIC = {"frame", "pose", "proprio", "instruction", "terminated", "truth"}
 
@@ -74,35 +127,44 @@ def cheaters(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     import cheaters
 
-    for kept in cheaters.FOUND.values():
-        kept.clear()
-    return cheaters
+    yield cheaters
+    del sys.modules["cheaters"]
 
 
-def stack():
-    return Stack({role: Choice(role, f"cheaters:{role.capitalize()}") for role in ROLES}, look_around=0)
+def stack(**others):
+    names = {role: role.capitalize() for role in ROLES} | others
+    return Stack({role: Choice(role, f"cheaters:{name}") for role, name in names.items()}, look_around=0)
 
 
 def check_found(cheaters, episodes):
     found = cheaters.FOUND
     assert found["truth"] and all(truth is None for truth in found["truth"])
     assert found["fields"] <= PUBLIC
+    # Behind an array lies its own memory and no more, and nobody writes into it later.
+    assert all(len(memoryview(thing).cast("B")) <= own for own, thing in found["behind"])
+    assert found["kept"] and all(np.array_equal(array, copy) for array, copy in found["kept"])
     # The same whatever the levels are: four modules, and the streams of the first and the second episode.
     assert {seed for seeds in found["seeds"] for seed in seeds.tolist()} == set(module_seeds(0, np.array([1, 2])))
     assert not {spec.seed for spec in episodes} & {seed for seeds in found["seeds"] for seed in seeds.tolist()}
 
 
-@pytest.mark.parametrize("seed", [7, 123])
-def test_in_a_rollout_a_cheating_plugin_finds_nothing(cheaters, seed):
+@pytest.mark.parametrize(("seed", "controller"), [(7, "Controller"), (123, "Flickering")])
+def test_in_a_rollout_a_cheating_plugin_finds_nothing(cheaters, seed, controller):
     episodes = Episodes(2, seed, difficulty=1)
-    results = rollout(stack().policy(), World(1, max_boxes=1, time_limit=6), episodes)
+    world, untouched = (World(1, max_boxes=1, time_limit=6) for _ in range(2))
+    results = rollout(stack(controller=controller).policy(), world, episodes)
     assert not any(result.solved for result in results)
     check_found(cheaters, episodes)
+    untouched.reset([0], [episodes[1]])
+    for _ in range(6):
+        untouched.step(np.zeros((1, 2), np.float32))
+    assert np.array_equal(world.pose, untouched.pose), "what a plugin writes into its inputs moves nothing"
 
 
-def test_in_the_graph_a_cheating_plugin_finds_nothing(cheaters, play_graph):
+@pytest.mark.parametrize("controller", ["Controller", "Flickering"])
+def test_in_the_graph_a_cheating_plugin_finds_nothing(cheaters, play_graph, controller):
     episodes = Episodes(2, 123, difficulty=1)
-    graph = play_graph(stack(), episodes, time_limit=6)
+    graph = play_graph(stack(controller=controller), episodes, time_limit=6)
     graph.finish()
     check_found(cheaters, episodes)
     hidden = {topic.name for topic in (*topics.TRUTH_TOPICS, topics.TOP_CAMERA)}
@@ -111,12 +173,12 @@ def test_in_the_graph_a_cheating_plugin_finds_nothing(cheaters, play_graph):
         assert isinstance(node, ModuleNode)
         assert not hidden & {subscription.topic_name for subscription in node.subscriptions}
         # What a module is given besides its inputs would show on it.
-        assert vars(node.module).keys() <= {"limit", "sample", "threshold", "privileged"}
+        assert vars(node.module).keys() <= {"limit", "sample", "threshold", "privileged", "asked"}
     public = set(topics.EPISODE.type.get_fields_and_field_types())
     assert public == {"header", "episode", "step", "ended"}
 
 
-def test_the_process_of_a_module_is_not_told_what_the_simulators_is(ros):
+def test_the_process_of_a_module_is_not_told_what_the_simulators_is(ros, cheaters):
     with Processes(graph_parameters(stack(), Episodes(1, 123, difficulty=1))) as processes:
         for role in ROLES:
             # What a plugin finds in its command line leads to this file, and to what lies beside it.
@@ -124,6 +186,46 @@ def test_the_process_of_a_module_is_not_told_what_the_simulators_is(ros):
             (told,) = yaml.safe_load(path.read_text()).items()
             assert told[0] == role and not {"seed", "difficulty", "level_file"} & told[1]["ros__parameters"].keys()
             assert not [file for file in path.parent.iterdir() if "simulator" in file.name]
+
+
+def test_an_instance_that_asks_otherwise_than_the_one_that_reports_name_does_not_play(cheaters, play_graph):
+    def named(*asks):
+        cheaters.Shifty.asks[:] = asks
+        shifty = stack(controller="Shifty")
+        return shifty, shifty.identities()["controller"]
+
+    hidden, name = named(False, True, False, True)
+    assert name == "cheaters:Shifty"
+    with pytest.raises(ValueError, match="controller cheaters:Shifty asks for the ground truth where another"):
+        hidden.policy()
+    graph = play_graph(hidden, names=["controller"])
+    graph.graph.stop("controller")
+    with pytest.raises(ValueError, match="controller cheaters:Shifty asks for the ground truth where another"):
+        graph.graph.start("controller")  # as after a crash
+    confessed, name = named(True, False, True, False)
+    assert name == "cheaters:Shifty (privileged)"
+    with pytest.raises(ValueError, match="controller cheaters:Shifty does not ask for the ground truth where another"):
+        confessed.policy()
+    assert confessed.policy().told == {"controller"}
+
+
+def test_an_agent_that_denies_what_it_sees_is_named_by_it(cheaters):
+    sly = Solo(Choice(AGENT, "cheaters:Sly"))
+    assert sly.identities() == {AGENT: "cheaters:Sly (privileged)"} and sly.policy().privileged
+    episodes = Episodes(1, 123, difficulty=1)
+    growing = Solo(Choice(AGENT, "cheaters:Growing"))
+    assert growing.identities() == {AGENT: "cheaters:Growing"}
+    assert play(growing, episodes, PlayOptions(time_limit=6)).results == evaluate(
+        growing.policy(), episodes, time_limit=6
+    )
+    check = cheaters.FOUND["truth"]
+    assert len(check) == 12 and all(truth is None for truth in check)
+
+
+def test_what_a_distribution_calls_scripted_is_named_by_what_it_asks_for(cheaters, monkeypatch):
+    offered = EntryPoint("planner.scripted", "cheaters:Confessing", plugins.GROUP)
+    monkeypatch.setattr(plugins, "_offered", lambda: {offered.name: offered})
+    assert Choice("planner", "scripted").identity() == "scripted (privileged)"
 
 
 def test_a_plugin_that_is_told_the_truth_is_named_so_everywhere(cheaters):

@@ -95,15 +95,18 @@ def test_a_map_tells_robot_box_and_solved_box_apart_and_shows_the_target_below()
 
 def test_the_live_view_names_instruction_and_modules_and_marks_those_that_are_told_the_truth():
     pytest.importorskip("rerun")
-    from bringup.live_layout import Shown, text
+    from bringup.live_layout import Shown, played, text
 
     truth = EpisodeTruth(episode=2, seed=7, difficulty=3, level="#@$.*#", step=40, boxes_on_target=1)
-    modules = {"planner": "oracle", "controller": "mine:Drive (privileged)", "estimator": "learned"}
+    teacher = played("learned (privileged)", "/home/me/teacher.safetensors")
+    modules = {"planner": "oracle", "controller": teacher, "estimator": "learned"}
     shown = text(Shown(Instruction(sequence=4, direction=Instruction.WEST), truth, modules))
     assert shown.startswith("# ← west\n")
     for part in ("| 2: seed 7, difficulty 3 |", "| 2.0 s |", "| 1 of 2 boxes |", "| **oracle** |", "| learned |"):
         assert part in shown
-    assert "| **mine:Drive (privileged)** |" in shown and "| termination | not heard yet |" in shown
+    assert "| **learned teacher.safetensors (privileged)** |" in shown and "| termination | not heard yet |" in shown
+    alone = text(Shown(None, truth, {"agent": "mine:Drive (privileged)"}))
+    assert "| agent | **mine:Drive (privileged)** |" in alone and "planner" not in alone
 
 
 def test_a_video_shows_both_views_and_what_the_modules_say(play_graph, tmp_path):
