@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
-from mujoban_core.plugins import PRIVILEGED, is_privileged
+from mujoban_core.plugins import PRIVILEGED, privileged_roles
 from mujoban_core.stats import wilson_interval
 
 
@@ -74,7 +74,7 @@ def report(results: Sequence[EpisodeResult], weights: Mapping[str, str], **extra
         "failures": dict(failures.most_common()),
         **extra,
         "weights": dict(weights),
-        "privileged": [role for role, identity in weights.items() if is_privileged(identity)],
+        "privileged": privileged_roles(weights),
         "episodes": [r.to_json() for r in results],
     }
 

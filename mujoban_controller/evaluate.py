@@ -27,6 +27,7 @@ from mujoban_controller.scripted import scripted_driver
 from mujoban_controller.turning import judge_turning
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_file, digest
+from mujoban_core.plugins import PRIVILEGED, privileged_roles
 from mujoban_core.program import read_options, run_command
 from mujoban_core.reports import give_report
 from mujoban_core.threads import set_threads
@@ -74,14 +75,14 @@ class Options:
 
 
 def make_driver(options: Options) -> tuple[Driver, str]:
-    """Return the driver and what identifies it: the digest of its weights, or its name."""
+    """Return the driver and what identifies it: the digest of its weights, or its name, and that it is privileged."""
     if options.driver == "scripted":
-        return scripted_driver, "scripted"
+        return scripted_driver, f"scripted{PRIVILEGED}"
     teacher = options.driver == "teacher"
     cls = PrivilegedPolicy if teacher else VisuomotorController
     weights = options.weights or (teacher_weights if teacher else camera_weights)(options.body)
     policy = load_weights(cls, weights, options.device, body=options.body)
-    return policy.driver(), digest(weights)
+    return policy.driver(), f"{digest(weights)}{PRIVILEGED if teacher else ''}"
 
 
 def main(command_line: Sequence[str] | None = None) -> int:
@@ -99,11 +100,13 @@ def main(command_line: Sequence[str] | None = None) -> int:
     else:
         plans = options.instructions == "plans"
         report = judge(driver, OraclePlanner(), **levels, batch=options.batch, plans=plans)
+    weights = {"controller": identity}
     told: dict[str, Any] = {
-        "weights": {"controller": identity}, "world": options.world, "n": options.episodes, "seed": options.seed,
+        "weights": weights, "privileged": privileged_roles(weights), "world": options.world, "n": options.episodes,
+        "seed": options.seed,
     }  # fmt: skip
     how = {name: getattr(options, name) for name in ("driver", "instructions", "difficulty", "body", "world")}
-    told |= noted_use(options.seed, options.episodes, told["weights"], {"program": PROG, **how})
+    told |= noted_use(options.seed, options.episodes, weights, {"program": PROG, **how})
     give_report({**report, **told}, options.json)
     return 0
 

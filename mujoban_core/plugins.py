@@ -9,7 +9,7 @@ without arguments, or to a function `(weights, device) -> Module`. `ROLE.weights
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -138,6 +138,11 @@ def check_told(role: str, source: str, asks: bool, told: bool | None) -> None:
 def is_privileged(identity: str) -> bool:
     """Tell from what a report calls a module whether it is told the ground truth."""
     return identity == ORACLE or identity.endswith(PRIVILEGED)
+
+
+def privileged_roles(weights: Mapping[str, str]) -> list[str]:
+    """Return which of the roles of a report's `weights` are told the ground truth: its entry `privileged`."""
+    return [role for role, identity in weights.items() if is_privileged(identity)]
 
 
 def shipped_weights(role: str, body: str | None = None) -> Path:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
 
-from mujoban_controller import camera_weights
+from mujoban_controller import camera_weights, evaluate, teacher_weights
 from mujoban_controller.controller import Sight, VisuomotorController
 from mujoban_controller.evaluate import Options, make_driver
 from mujoban_core.bodies import BALL, INERTIAL_SIZE
@@ -160,3 +162,22 @@ def test_unknown_bodies_are_refused():
 def test_an_evaluation_drives_a_body_with_the_weights_that_ship_for_it():
     _, identity = make_driver(Options(body="ant"))
     assert identity == digest(camera_weights("ant"))
+
+
+@pytest.mark.parametrize(
+    ("driver", "name", "privileged"),
+    [
+        ("camera", digest(camera_weights("ball")), []),
+        ("teacher", f"{digest(teacher_weights('ball'))} (privileged)", ["controller"]),
+        ("scripted", "scripted (privileged)", ["controller"]),
+    ],
+)
+def test_the_report_of_an_evaluation_says_which_driver_is_told_the_truth(
+    driver, name, privileged, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(evaluate, "judge", lambda *driven, **levels: {"success_rate": 1.0})
+    file = tmp_path / "report.json"
+    assert evaluate.main(["--driver", driver, "--episodes", "1", "--json", str(file)]) == 0
+    report = json.loads(file.read_text())
+    assert report["success_rate"] == 1.0 and report["weights"] == {"controller": name}
+    assert report["privileged"] == privileged
