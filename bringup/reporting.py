@@ -12,7 +12,7 @@ from bringup.options import EpisodeOptions
 from bringup.results import EpisodeResult, report, summary
 from mujoban_core.bodies import get_body
 from mujoban_core.files import digest
-from mujoban_core.reports import use_of_test_levels, write_report
+from mujoban_core.reports import write_report
 from mujoban_core.signals import StopSignal
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import seed_range
@@ -73,8 +73,9 @@ class Reporting:
         self._path, self._weights, self._asked = path, weights, len(episodes)
         self._game = {"body": game["body"], "world": game["world"], "played": dict(game)}
         # Of a level file seeds do not tell which levels are kept for tests.
-        generated = not episodes.source.levels
-        self._on_test_levels = generated and seed_range(episodes.seed, len(episodes)) == "test"
+        self._generated = not episodes.source.levels
+        if self._generated:
+            seed_range(episodes.seed, len(episodes))  # refuses what `finish` could not report
 
     def finish(self, results: Sequence[EpisodeResult], **extra: Any) -> None:
         """Print the summary and write the report.
@@ -87,12 +88,11 @@ class Reporting:
             OSError: If it cannot be written.
         """
         content = report(results, self._weights, **self._game, **extra)
-        if self._on_test_levels:
-            from mujoban_rl.weights import provenance
+        if self._generated:
+            from mujoban_rl.sealed_levels import noted_use
 
             seeds = [entry["seed"] for entry in content["episodes"]]
-            use = use_of_test_levels(provenance()["commit"], self._weights, (min(seeds), max(seeds)), content["played"])
-            content["test_uses"] = [use]
+            content |= noted_use(min(seeds), max(seeds) - min(seeds) + 1, self._weights, content["played"])
         print(*summary(content), sep="\n", flush=True)
         if self._path is not None:
             write_report(content, self._path)

@@ -7,25 +7,50 @@ So a report says by which code and weights they were used, and a file that is wr
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from mujoban_core.files import write_atomically
 
 
-def use_of_test_levels(
-    commit: str | None, weights: Mapping[str, str], seeds: tuple[int, int], played: Mapping[str, Any] | None
-) -> dict[str, Any]:
-    """Return the entry of a report's `test_uses` list: what was evaluated on test levels, on which, and how.
+def count_uses(uses: Iterable[Mapping[str, Any]]) -> int:
+    """Return how often test levels were used, by the entries of a report's `test_uses` list.
+
+    A use is an evaluation of some weights in some game. Entries of the same weights and game are parts of one while no
+    level comes twice among them; with each further time that it does they are one evaluation more. An entry that is
+    there twice, word for word, was written down twice and counts once.
 
     Args:
-        commit: Of the code.
-        weights: What identifies each module.
-        seeds: Of the first and the last level.
-        played: How; None where that is not known.
+        uses: What `mujoban_rl.sealed_levels.noted_use` returns.
     """
-    return {"commit": commit, "weights": dict(weights), "seeds": list(seeds), "played": played}
+    steps: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    for text in dict.fromkeys(json.dumps(use, sort_keys=True) for use in uses):
+        use = json.loads(text)
+        # Parts begin with different levels.
+        game = {key: value for key, value in (use["played"] or {}).items() if key != "seed"}
+        first, last = use["seeds"]
+        steps[json.dumps([use["weights"], game])] += [(first, 1), (last + 1, -1)]
+    return sum(_most_at_once(changes) for changes in steps.values())
+
+
+def _most_at_once(changes: Iterable[tuple[int, int]]) -> int:
+    """Return how many intervals overlap at most, given where each begins (+1) and where it is over (-1)."""
+    most = now = 0
+    for _, change in sorted(changes):
+        now += change
+        most = max(most, now)
+    return most
+
+
+def noted_uses(path: Path) -> list[dict[str, Any]]:
+    """Return the uses of the test range that a report lists; none where there is no report, or a damaged one."""
+    try:
+        report = json.loads(path.read_text())
+    except (FileNotFoundError, json.JSONDecodeError):
+        return []
+    return list(report.get("test_uses", [])) if isinstance(report, dict) else []
 
 
 def write_report(content: Mapping[str, Any], path: Path, *, indent: int | None = 2) -> None:
@@ -36,8 +61,9 @@ def write_report(content: Mapping[str, Any], path: Path, *, indent: int | None =
         path: Its file.
         indent: Of nested lines; None for a single line.
     """
-    if path.is_file() and "test_uses" in content:
-        content = {**content, "test_uses": [*_noted_uses(path), *content["test_uses"]]}
+    if "test_uses" in content:
+        noted = noted_uses(path)
+        content = {**content, "test_uses": [*noted, *(use for use in content["test_uses"] if use not in noted)]}
     write_atomically(path, (json.dumps(content, indent=indent) + "\n").encode())
 
 
@@ -47,11 +73,3 @@ def give_report(report: Mapping[str, Any], file: Path | None) -> None:
         print(json.dumps(report, indent=2))
     else:
         write_report(report, file)
-
-
-def _noted_uses(path: Path) -> list[Any]:
-    try:
-        earlier = json.loads(path.read_text())
-    except json.JSONDecodeError:
-        return []
-    return list(earlier.get("test_uses", [])) if isinstance(earlier, dict) else []

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Any
 
-from mujoban_core.reports import use_of_test_levels
 from mujoban_rl.weights import provenance
 from mujoban_sokoban.generator import seed_range
 
 
 def noted_use(first: int, count: int, weights: Mapping[str, str], played: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entry `test_uses` of a report on `count` levels with the seeds from `first` on; none of others.
+
+    It lists what was evaluated, on which levels, by which code, how and when; `mujoban_core.reports.count_uses` counts.
 
     Args:
         first: Seed of the first level.
@@ -24,4 +26,8 @@ def noted_use(first: int, count: int, weights: Mapping[str, str], played: Mappin
     """
     if seed_range(first, count) != "test":
         return {}
-    return {"test_uses": [use_of_test_levels(provenance()["commit"], weights, (first, first + count - 1), played)]}
+    use = {
+        "commit": provenance()["commit"], "weights": dict(weights), "seeds": [first, first + count - 1],
+        "played": dict(played), "when": datetime.now(UTC).isoformat(timespec="seconds"),
+    }  # fmt: skip
+    return {"test_uses": [use]}

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from benchmarks.paper import bodies, curves, figures, film, tables
+from benchmarks.paper import baselines, bodies, curves, figures, film, tables
 from benchmarks.paper.baselines import HOURS, JOINT
 from benchmarks.paper.runs import (
     ALL,
@@ -88,6 +88,7 @@ def rebuild(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     sections = [
         INTRODUCTION,
+        tables.test_uses((*ALL, *bodies.RUNS, *baselines.RUNS), map(film.load, film.FILMS.values())),
         "## Table 1: main results\n",
         tables.configurations((CONFIGURATIONS[0], POLICY_ALONE[0])),
         TABLE_1,
@@ -109,7 +110,6 @@ def rebuild(folder: Path) -> Path:
         tables.configurations(LOOKING_AROUND),
         "## Figure 2: success against difficulty\n",
         tables.configurations(DIFFICULTY),
-        tables.test_uses(ALL),
         *_figure_2(DIFFICULTY, folder),
         "## Figure 3: an episode\n",
         *_film_strip(BALL.name, "Figure 3", folder / "figure3.png"),
@@ -118,7 +118,6 @@ def rebuild(folder: Path) -> Path:
         "## Figure 5: another body, the same planner\n",
         FIGURE_5,
         tables.configurations(bodies.RUNS),
-        tables.test_uses(bodies.RUNS),
         *_figure_5(folder),
         *_film_strip(ANT.name, "An episode of the ant", folder / "figure5_ant.png"),
     ]

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from benchmarks.paper.runs import ROOT, SEED, Options, Run, is_stale
 from bringup.results import EpisodeResult, Failure, report
-from mujoban_core.reports import use_of_test_levels, write_report
+from mujoban_core.reports import noted_uses, write_report
 
 PARTS: Final = ROOT / "runs" / "paper"
 """Where parts lie until their evaluation is whole."""
@@ -44,6 +44,11 @@ class Part:
             return None
         return None if len(content["episodes"]) != self.episodes or is_stale(content, self.run) else content
 
+    def forget(self) -> None:
+        """Have it measured anew; that its levels were used stays noted."""
+        if uses := noted_uses(self.file):
+            write_report({"episodes": [], "test_uses": uses}, self.file)
+
     def start(self) -> subprocess.Popen[bytes]:
         """Measure it in a process of its own."""
         command = [sys.executable, "bringup/evaluate.py", *self.run.options(), "--seed", str(SEED + self.first)]
@@ -65,7 +70,7 @@ def evaluate(run: Run, options: Options) -> None:
     ]
     if options.again:
         for part in parts:
-            part.file.unlink(missing_ok=True)
+            part.forget()
     waiting = [part for part in parts if part.load() is None]
     running: list[tuple[Part, subprocess.Popen[bytes]]] = []
     start = time.monotonic()
@@ -102,13 +107,9 @@ def _join(parts: list[Part]) -> dict[str, Any]:
         raise ValueError(f"{parts[0].run.name}: the weights changed while it ran; the same command goes on")
     episodes = [_episode(entry) for content in reports for entry in content["episodes"]]
     joined = report(episodes, json.loads(weights.pop()), **_common(parts[0].run, reports))
-    # The parts are one use of the test levels together.
-    commits = {use["commit"] for content in reports for use in content.get("test_uses", [])}
-    seeds = [episode.seed for episode in episodes]
-    use = use_of_test_levels(
-        ", ".join(sorted(map(str, commits))), joined["weights"], (min(seeds), max(seeds)), joined.get("played")
-    )
-    return {**joined, "test_uses": [use]}
+    # Also of parts of another size, or of other weights, that were measured before.
+    uses = [use for file in sorted((PARTS / parts[0].run.name).glob("*.json")) for use in noted_uses(file)]
+    return {**joined, "test_uses": uses} if uses else joined
 
 
 def _common(run: Run, reports: list[dict[str, Any]]) -> dict[str, Any]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from benchmarks.paper.baselines import AGAIN, BASELINES, MODULAR, RECORDING, points_of
-from benchmarks.paper.runs import DIFFICULTY, Run, is_stale, load
+from benchmarks.paper.runs import DIFFICULTY, Run, distinct, is_stale, load
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.reports import count_uses
 
 STALE = " †"
 """Marks a result of other weights than those that ship now."""
@@ -54,13 +55,23 @@ def differences(one: Run, other: Run) -> str:
     )
 
 
-def test_uses(runs: Sequence[Run]) -> str:
-    """Return how often the test levels were used for these rows, as their JSON has it."""
-    uses = [report.get("test_uses") for report in map(load, runs) if report]
-    counted = sum(len(entries) for entries in uses if entries)
-    unknown = sum(entries is None for entries in uses)
-    before = f"; {unknown} of the rows were measured before uses were counted" if unknown else ""
-    return f"The test levels were used {counted} times for these rows{before}.\n"
+def test_uses(runs: Iterable[Run], films: Iterable[dict[str, Any] | None]) -> str:
+    """Return how often the test levels were used for rows and for film strips, as their JSON has it.
+
+    Args:
+        runs: Of the rows; one that comes twice counts once.
+        films: Recorded episodes; None where there is none.
+    """
+    rows = [report for run in distinct(runs) if (report := load(run)) is not None]
+    strips = [episode for episode in films if episode is not None]
+    counts = [sum(count_uses(report.get("test_uses", [])) for report in kind) for kind in (rows, strips)]
+    unknown = sum("test_uses" not in report for report in (*rows, *strips))
+    before = f" {unknown} of them were measured before uses were noted." if unknown else ""
+    return (
+        f"For this page test levels were used {sum(counts)} times: {counts[0]} evaluations for {len(rows)} rows of its "
+        f"tables, {counts[1]} recordings for {len(strips)} film strips.{before} Each is noted in `json/` with its "
+        "code, weights and levels (`test_uses`); what was measured again, as with other weights, counts again.\n"
+    )
 
 
 def baselines() -> str:

@@ -1,6 +1,7 @@
 """Tables and figures of the paper: rebuilt from JSON, marked when stale, missing sources named with their command."""
 
 import json
+import subprocess
 
 import pytest
 
@@ -13,7 +14,7 @@ from mujoban_baselines.train import COMMANDS, PROG
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
 from mujoban_core.program import read_options
-from mujoban_core.reports import write_report
+from mujoban_core.reports import count_uses, noted_uses, write_report
 from mujoban_planner import curves as planner_curves
 
 ORACLES = Stack({role: Choice(role, "oracle") for role in ROLES})
@@ -110,7 +111,8 @@ def test_an_evaluation_goes_on_where_it_was_ended_and_gives_what_one_run_gives(f
     game = whole["played"]
     assert (game["difficulty"], game["seed"], game["look_ahead"]) == (1, runs.SEED, 0)
     assert game["world"] == whole["world"]
-    assert [use["played"] for use in whole["test_uses"]] == [game]
+    used = [use["seeds"] for use in whole["test_uses"]]
+    assert used == [[runs.SEED, runs.SEED + 1], [runs.SEED + 2] * 2] and count_uses(whole["test_uses"]) == 1
     assert "easy: 3 of 3 levels, solved 3 (100.0 %)" in capfd.readouterr().out
     EASY.file.unlink()
     monkeypatch.setattr(parts.Part, "start", lambda part: pytest.fail(f"{part} has been measured already"))
@@ -126,7 +128,42 @@ def test_an_evaluation_goes_on_where_it_was_ended_and_gives_what_one_run_gives(f
     parts.evaluate(EASY, options)
     joined = runs.load(EASY)
     assert "played" not in joined and joined["body"] == "ball" and joined["episodes"] == whole["episodes"]
-    assert joined["test_uses"][-1]["played"] is None
+    assert joined["test_uses"] == whole["test_uses"], "nothing was measured, nothing is counted"
+
+
+def test_what_is_measured_again_stays_noted(folder, monkeypatch):
+    monkeypatch.setattr(parts, "_POLL", 0.0)
+
+    def start(part):
+        measured = {"when": f"measured {len(noted_uses(part.file))} times before"}
+        use = {"commit": "c", "weights": {}, "seeds": [part.first] * 2, "played": {"seed": part.first}}
+        write(EASY, 1, 1, {"planner": "oracle"})
+        content = json.loads(EASY.file.read_text())
+        EASY.file.unlink()
+        part.file.parent.mkdir(parents=True, exist_ok=True)
+        write_report({**content, "test_uses": [use | measured]}, part.file)
+        return subprocess.Popen(["true"])
+
+    monkeypatch.setattr(parts.Part, "start", start)
+    for again, expected in ((False, 1), (False, 1), (True, 2)):
+        parts.evaluate(EASY, runs.Options(episodes=2, part=1, again=again))
+        uses = runs.load(EASY)["test_uses"]
+        assert len(uses) == 2 * expected and count_uses(uses) == expected
+
+
+def test_the_page_says_once_how_often_test_levels_were_used(folder):
+    def note(file, *seeds):
+        uses = [{"commit": "c", "weights": {}, "seeds": [s, s + 3], "played": None} for s in seeds]
+        file.write_text(json.dumps({**json.loads(file.read_text()), "test_uses": uses}))
+
+    rows = [runs.CONFIGURATIONS[0], runs.CONFIGURATIONS[1], baselines.BASELINES[1].run(1), runs.GRAPH]
+    for run in rows:
+        write(run, 3, 4, {})
+    note(rows[0].file, 0, 4)
+    note(rows[1].file, 0, 2)
+    note(rows[2].file, 0)
+    (page,) = [line for line in results.rebuild(folder).read_text().splitlines() if "test levels were used" in line]
+    assert "used 4 times: 4 evaluations for 4 rows of its tables, 0 recordings for 0 film strips. 1 of them" in page
 
 
 def test_a_part_that_was_interrupted_is_measured_anew(folder):

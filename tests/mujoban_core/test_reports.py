@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from mujoban_controller import evaluate as controller
-from mujoban_core.reports import give_report
+from mujoban_core.reports import count_uses, give_report
 from mujoban_planner import evaluate as planner
 
 
@@ -31,6 +32,21 @@ def test_evaluating_a_module_on_test_levels_is_noted_with_what_was_noted_before(
     assert all(use["played"]["difficulty"] == 1 for use in content["test_uses"])
     assert main([*few, "--seed", "5000000"]) == 0
     assert "test_uses" not in json.loads(report.read_text()), "a report on other levels is another one"
+
+
+def test_parts_of_an_evaluation_are_one_use_and_each_further_look_at_a_level_is_another() -> None:
+    def use(first: int, last: int, planner: str = "a", **other: Any) -> dict[str, Any]:
+        game = {"seed": first, "difficulty": 5}
+        return {"commit": "c", "weights": {"planner": planner}, "seeds": [first, last], "played": game} | other
+
+    halves = [use(0, 3), use(4, 7, commit="d")]
+    assert count_uses([]) == 0 and count_uses(halves) == 1
+    assert count_uses([*halves, use(0, 3)]) == 1, "an entry that is there twice"
+    assert count_uses([*halves, use(0, 3, when="later")]) == 2
+    assert count_uses([*halves, use(3, 4, commit="e")]) == 2
+    assert count_uses([*halves, use(8, 9, planner="b")]) == 2
+    assert count_uses([*halves, use(8, 9, played={"difficulty": 4})]) == 2
+    assert count_uses([use(0, 3, played=None), use(2, 5, played=None)]) == 2
 
 
 def test_what_stands_in_a_damaged_report_is_replaced(tmp_path: Path) -> None:
