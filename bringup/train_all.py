@@ -149,7 +149,11 @@ class Options:
 
 
 def stages(options: Options) -> list[Stage]:
-    """Return all stages of a run, each after what it needs."""
+    """Return all stages of a run, each after what it needs.
+
+    Raises:
+        WeightsError: If the planner that is gone on from has no record.
+    """
     evaluations = (_evaluation(options, name) for name in EVALUATIONS)
     found = [*_controller(options), *_planner(options), *_senses(options), *evaluations]
     order = list(SHARES)
@@ -176,7 +180,7 @@ def _sources(options: Options, *products: str) -> tuple[Path, ...]:
 
 def _trainer(
     options: Options, name: str, command: Sequence[str], product: str, *needs: str, beside: Sequence[str] = (),
-    sources: Sequence[Path] = (),
+    sources: Sequence[Path] = (), last: Sequence[str] = (),
 ) -> Stage:  # fmt: skip
     """Return a stage that trains for its share of the hours, which no limit of steps cuts short.
 
@@ -188,12 +192,13 @@ def _trainer(
         needs: Stages before it.
         beside: What it makes beside its product.
         sources: What it takes from elsewhere.
+        last: Options that count against those of the machine.
     """
     seconds, machine = _seconds(options, name), options.machine
     arguments = ("-m", *command, "--run", str(options.run / name), *machine.budget(name, _SAVED * seconds))
     outputs = tuple(options.run / path for path in (product, *beside))
     return Stage(
-        name, (*arguments, *machine.sizes(name)), outputs, needs, seconds, machine.cores_of(name),
+        name, (*arguments, *machine.sizes(name), *last), outputs, needs, seconds, machine.cores_of(name),
         sources=tuple(sources),
     )  # fmt: skip
 
@@ -238,13 +243,16 @@ def _planner(options: Options) -> list[Stage]:
         ("--seed", str(2 * options.seed + i), "--evaluate-every", str(seconds)) for i, seconds in enumerate(every)
     )
     whole = PRODUCTS["whole"]
+    network = () if options.before is None else options.machine.begun_with(options.before / whole)
     views = ("--init", str(options.run / whole), "--learning-rate", "7e-4", *_VIEWS)
     return [
         _trainer(
             options, "planner", (*method, *first, *_from_before(options, "--init", "whole")), whole,
-            sources=_sources(options, "whole"),
+            sources=_sources(options, "whole"), last=network,
         ),
-        _trainer(options, "planner_views", (*method, *second, *views), WEIGHTS["planner"], "planner"),
+        _trainer(
+            options, "planner_views", (*method, *second, *views), WEIGHTS["planner"], "planner", last=network,
+        ),
     ]  # fmt: skip
 
 

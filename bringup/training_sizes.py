@@ -7,16 +7,19 @@ clock, batches that keep it busy, and cores that play, search and read for it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
 
 _NEVER: Final = "1000000000"
 """CPU seconds that nothing uses up."""
+_GPU_NETWORK: Final[Mapping[str, Any]] = {"architecture": "thinking", "channels": 64, "blocks": 12, "tied": 6}
+"""Of the planner on a GPU; on cores it has that of its trainer."""
 _SEARCHING: Final = (
     "--trees", "768", "--batch-size", "2048", "--buffer", "1500000", "--first-evaluations", "60000",
     "--evaluations", "3", "--expansions", "80", "--questions", "60",
-    "--architecture", "thinking", "--channels", "64", "--blocks", "12", "--tied", "6", "--thoughts", "1", "2", "1", "4",
-    "--actors", "processes", "--schedule", "first",
+    *(text for name, value in _GPU_NETWORK.items() for text in (f"--{name}", str(value))),
+    "--thoughts", "1", "2", "1", "4", "--actors", "processes", "--schedule", "first",
 )  # fmt: skip
 """Of the planner: a larger network, whose searches run beside its learner, and larger ones."""
 _ON_GPU: Final[Mapping[str, tuple[str, ...]]] = {
@@ -67,6 +70,34 @@ class Machine:
         if self.gpu:
             return ("--device", self.device, "--cpu-seconds", _NEVER, "--horizon-seconds", str(round(seconds)))
         return ("--cpu-seconds", str(round(seconds * self.cores_of(stage))))
+
+    def begun_with(self, planner: Path) -> tuple[str, ...]:
+        """Return the options, after `sizes`, by which trainings of the planner can begin with weights of another.
+
+        What the other was taught on a GPU goes on without one, slower, and the other way round; none are needed where
+        the network of this machine holds the other's.
+
+        Raises:
+            WeightsError: If the weights have no record, or it is none of a planner.
+        """
+        # They import PyTorch, which a run from nothing can do without.
+        from mujoban_planner.expert_iteration import ExpertIterationConfig
+        from mujoban_planner.validation import NetworkConfig
+        from mujoban_rl.weights import read_record
+
+        own = ExpertIterationConfig().network
+        own = replace(own, **_GPU_NETWORK) if self.gpu else own
+        needed = own.holding(NetworkConfig.of(planner))
+        options = list[str]()
+        for name, value in asdict(needed).items():
+            if isinstance(value, bool):
+                options += [] if value == getattr(own, name) else [f"--{'' if value else 'no-'}{name}"]
+            elif value != getattr(own, name):
+                options += [f"--{name}", str(value)]
+        if needed.architecture == "thinking" != own.architecture:
+            thoughts = read_record(planner).get("training", {}).get("thoughts", [])
+            options += ["--thoughts", *map(str, thoughts)] if thoughts else []
+        return tuple(options)
 
     def sizes(self, stage: str) -> tuple[str, ...]:
         """Return the options that say how large a training is."""

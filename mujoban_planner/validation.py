@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Final, Literal
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Final, Literal, Self, cast, get_args
 
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
+from mujoban_rl.weights import WeightsError, read_record
 from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_batch
 from mujoban_sokoban.levels import LevelBatch
 
@@ -15,6 +17,8 @@ _FIRST_SEED: Final = 9_000_000
 _EPISODES: Final = {5: 256, 4: 64, 1: 64}
 """Difficulty -> episodes of a periodic evaluation."""
 
+
+Architecture = Literal["residual", "thinking", "recurrent"]
 
 Shares = tuple[float, float, float, float, float]
 """Shares of difficulties 1 to 5 among levels."""
@@ -29,7 +33,7 @@ def difficulty_shares(shares: Shares) -> dict[int, float]:
 class NetworkConfig:
     """What defines a planner network."""
 
-    architecture: Literal["residual", "thinking", "recurrent"] = "residual"
+    architecture: Architecture = "residual"
     """Network."""
     channels: int = 64
     """Channels of the network."""
@@ -46,6 +50,33 @@ class NetworkConfig:
 
     judge: bool = True
     """Judge each push where the box is (with propagation)."""
+
+    @classmethod
+    def of(cls, weights: Path) -> Self:
+        """Return the network of trained weights, by their record.
+
+        Raises:
+            WeightsError: If there is no record, or it is none of a planner.
+        """
+        record = read_record(weights)
+        name = record["class"].removesuffix("Planner").lower()
+        if name not in get_args(Architecture):
+            raise WeightsError(f"{weights}: holds weights of {record['class']}, expected those of a planner")
+        names = {f.name for f in fields(NetworkConfig)}
+        sizes = {key: value for key, value in record["config"].items() if key in names}
+        return cls(architecture=cast(Architecture, name), **({"judge": False} | sizes))
+
+    def holding(self, smaller: NetworkConfig) -> NetworkConfig:
+        """Return this network, or as much larger a one as can begin with weights of another (`growth.start_from`)."""
+        ours = self.network
+        if "recurrent" in (ours.architecture, smaller.architecture):
+            return smaller
+        ours = replace(
+            ours, channels=max(ours.channels, smaller.channels), propagation=smaller.propagation, judge=smaller.judge
+        )
+        if smaller.architecture == "thinking":  # which blocks are repeated has to stay
+            return replace(ours, architecture="thinking", blocks=smaller.blocks, tied=smaller.tied)
+        return replace(ours, blocks=max(ours.blocks, smaller.blocks))
 
     @property
     def network(self) -> NetworkConfig:

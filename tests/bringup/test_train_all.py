@@ -16,10 +16,14 @@ import mujoban_estimator.train
 import mujoban_planner.train
 from bringup.options import WorldOptions
 from bringup.pipeline import Pipeline
-from bringup.train_all import PRODUCTS, WEIGHTS, Options, stages
+from bringup.train_all import PRODUCTS, WEIGHTS, Options, stages, train_all
 from bringup.training_report import EVALUATIONS, write_report
 from mujoban_core.program import read_options
+from mujoban_planner.expert_iteration import ExpertIterationConfig
+from mujoban_planner.growth import start_from
 from mujoban_planner.training_levels import LAST_SEED, TrainingLevels, stream_number
+from mujoban_planner.validation import NetworkConfig
+from mujoban_rl.weights import save_weights
 from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range
 
 
@@ -27,12 +31,14 @@ def commands(options: Options) -> dict[str, tuple[str, ...]]:
     return {stage.name: stage.command for stage in stages(options)}
 
 
-def finished(folder: Path) -> Path:
-    """Make what a finished run leaves; stages look at names alone."""
+def finished(folder: Path, planner: NetworkConfig | None = None, **training: Any) -> Path:
+    """Make what a finished run leaves; stages look at names, and at the record of the planner."""
     for product in PRODUCTS.values():
         path = folder / product
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
+    network = (planner or ExpertIterationConfig().network).build()
+    save_weights(folder / PRODUCTS["whole"], network, network.config, {"training": training})
     return folder
 
 
@@ -67,6 +73,45 @@ def test_a_continued_run_takes_every_module_from_the_one_before(tmp_path: Path) 
     first = found["estimator_first"]
     assert first[first.index("--start") + 1] == str((before / PRODUCTS["estimator"]).parent)
     assert str(before / PRODUCTS["first"]) in first and str(before / PRODUCTS["second"]) in found["estimator_second"]
+
+
+@pytest.mark.parametrize(
+    ("device", "before", "expected"),
+    [
+        ("cpu", NetworkConfig("thinking", 64, 12, 6), NetworkConfig("thinking", 64, 12, 6)),
+        ("cpu", NetworkConfig("residual", 32, 8), NetworkConfig("residual", 48, 8)),
+        ("cpu", NetworkConfig("residual", 64, 4, judge=False), NetworkConfig("residual", 64, 6, judge=False)),
+        ("cpu", NetworkConfig("recurrent", 16, depth=2), NetworkConfig("recurrent", 16, depth=2)),
+        ("cuda", NetworkConfig("residual", 48, 6), NetworkConfig("thinking", 64, 12, 6)),
+        ("cuda", NetworkConfig("thinking", 80, 9, 5), NetworkConfig("thinking", 80, 9, 5)),
+    ],
+)
+def test_a_planner_goes_on_in_a_network_that_holds_the_one_before(
+    tmp_path: Path, device: str, before: NetworkConfig, expected: NetworkConfig
+) -> None:
+    former = finished(tmp_path / "before", before, thoughts=[1, 4])
+    found = commands(Options(run=tmp_path / "run", before=former, device=device, cores=4))
+    for stage in ("planner", "planner_views"):
+        options = read_options({"expert-iteration": mujoban_planner.train.ExpertIteration}, found[stage][2:], stage)
+        network = options.config.build()
+        assert network.config == expected.build().config
+        start_from(network, former / PRODUCTS["whole"])
+        taught = {"cuda": (1, 2, 1, 4), "cpu": (1, 4) if before.architecture == "thinking" else (1,)}
+        assert options.config.thoughts == taught[device]
+
+
+def test_a_planner_of_the_same_size_needs_no_options(tmp_path: Path) -> None:
+    """So the commands of runs that were begun before stay what they were."""
+    begun = commands(Options(run=tmp_path / "run", before=finished(tmp_path / "before")))
+    assert not {"--architecture", "--channels", "--blocks", "--thoughts"} & {*begun["planner"], *begun["planner_views"]}
+
+
+def test_a_planner_without_a_record_is_refused_before_anything_begins(tmp_path: Path) -> None:
+    before, run = finished(tmp_path / "before"), tmp_path / "run"
+    (before / PRODUCTS["whole"]).with_suffix(".json").unlink()
+    with pytest.raises(ValueError, match=r"planner\.json: no record beside the weights; expected a JSON file"):
+        train_all(Options(run=run, before=before))
+    assert not run.exists()
 
 
 def test_a_run_whose_bags_are_gone_is_continued_with_new_ones_alone(tmp_path: Path) -> None:
