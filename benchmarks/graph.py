@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Any
 
 import torch
+from tyro.conf import arg
 
 from benchmarks.command import run_benchmark
 from bringup.command import Choice, Stack
+from bringup.options import WorldOptions
 from bringup.rollout import rollout
 from bringup.stack import PlayOptions, play
 from mujoban_core.plugins import ROLES
@@ -41,15 +43,21 @@ class Options:
     """Measure answers in real time at this speed, without and with a search ahead; 0: throughput in lockstep."""
     look_ahead: int = 400
     """Evaluations of that search."""
+    physics: Annotated[WorldOptions, arg(name="")] = field(default_factory=WorldOptions)
 
     def stack(self, look_ahead: int | None = None) -> Stack:
         """Return the stack to measure."""
         choices = {role: Choice(role, "oracle" if role in self.oracle else "learned") for role in ROLES}
-        return Stack(choices, deliberation=Deliberation(look_ahead=look_ahead))
+        return Stack(choices, deliberation=Deliberation(look_ahead=look_ahead), body=self.physics.body)
+
+    def play_options(self) -> PlayOptions:
+        """Return how the graph is run."""
+        return PlayOptions(world=self.physics.world, realtime=self.realtime, time_limit=self.ticks)
 
 
-def _in_process(policy: SensePlanAct, episodes: Episodes, ticks: int) -> float:
-    world = World(1, max_boxes=episodes.max_boxes, time_limit=ticks)
+def _in_process(policy: SensePlanAct, episodes: Episodes, options: Options) -> float:
+    physics, ticks = options.physics, options.ticks
+    world = World(1, body=physics.body, world=physics.world, max_boxes=episodes.max_boxes, time_limit=ticks)
     start = time.perf_counter()
     steps = sum(result.steps for result in rollout(policy, world, episodes))
     seconds = time.perf_counter() - start
@@ -64,11 +72,11 @@ def run(options: Options | None = None) -> dict[str, float]:
     stack = chosen.stack()
     policy = stack.policy()
     episodes = Episodes(1, chosen.seed, difficulty=chosen.difficulty)
-    _in_process(policy, episodes, 20)
+    _in_process(policy, episodes, replace(chosen, ticks=20))
     rates: list[tuple[float, float]] = []
     for _ in range(chosen.rounds):
-        graph = play(stack, episodes, PlayOptions(time_limit=chosen.ticks)).ticks_per_second
-        rates.append((graph, _in_process(policy, episodes, chosen.ticks)))
+        graph = play(stack, episodes, chosen.play_options()).ticks_per_second
+        rates.append((graph, _in_process(policy, episodes, chosen)))
     return {
         "graph_ticks_per_second": statistics.median(graph for graph, _ in rates),
         "rollout_ticks_per_second": statistics.median(plain for _, plain in rates),
@@ -83,11 +91,10 @@ def answers(options: Options) -> dict[str, dict[str, float]]:
     """
     torch.set_num_threads(1)
     episodes = Episodes(1, options.seed, difficulty=options.difficulty)
-    play_options = PlayOptions(realtime=options.realtime, time_limit=options.ticks)
     rounds: dict[str, list[dict[str, float]]] = {"alone": [], "looking_ahead": []}
     for _ in range(options.rounds):
         for name, evaluations in (("alone", 0), ("looking_ahead", options.look_ahead)):
-            outcome = play(options.stack(evaluations), episodes, play_options)
+            outcome = play(options.stack(evaluations), episodes, options.play_options())
             late = outcome.counts["simulator: late answers"] / outcome.results[0].steps
             rounds[name].append({**outcome.answer_ms, "late": late})
     return {

@@ -12,7 +12,7 @@ import statistics
 import time
 import urllib.request
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from urllib.error import URLError
 
 import torch
@@ -46,14 +46,14 @@ def _await_page(port: int) -> None:
             time.sleep(0.2)
 
 
-def _measure(stack: Stack, episodes: Episodes, ticks: int) -> tuple[float, float]:
+def _measure(stack: Stack, episodes: Episodes, options: PlayOptions) -> tuple[float, float]:
     """Return ticks per second, and milliseconds of processor time that this process spends on a tick."""
     seen: list[tuple[int, float]] = []
 
     def note(monitor: MonitorNode, _: Sequence[EpisodeResult]) -> None:
         seen.append((monitor.ticks, time.process_time()))
 
-    rate = play(stack, episodes, PlayOptions(time_limit=ticks), on_refresh=note).ticks_per_second
+    rate = play(stack, episodes, options, on_refresh=note).ticks_per_second
     # From the first tick on: making the nodes does not count.
     running = [(tick, seconds) for tick, seconds in seen if tick > 0]
     (first, start), (last, end) = running[0], running[-1]
@@ -69,13 +69,13 @@ def run(options: Options | None = None) -> dict[str, float]:
     plain: list[tuple[float, float]] = []
     viewed: list[tuple[float, float]] = []
     with claim_domain():
-        play(stack, episodes, PlayOptions(time_limit=20))
+        play(stack, episodes, replace(chosen, ticks=20).play_options())
         for _ in range(chosen.rounds):
-            plain.append(_measure(stack, episodes, chosen.ticks))
+            plain.append(_measure(stack, episodes, chosen.play_options()))
             port = free_port(WEB_PORT)
             with viewer(LOOPBACK):
                 _await_page(port)
-                viewed.append(_measure(stack, episodes, chosen.ticks))
+                viewed.append(_measure(stack, episodes, chosen.play_options()))
     pairs = list(zip(plain, viewed, strict=True))
     return {
         "ticks_per_second": statistics.median(rate for rate, _ in plain),

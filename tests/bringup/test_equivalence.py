@@ -61,6 +61,11 @@ def test_an_ant_does_the_same_in_the_graph_as_in_process(play_graph, oracles, an
     assert_equal_runs(play_graph, stack, Episodes(1, 3, difficulty=1), 30)
 
 
+def test_the_ant_that_ships_sees_and_does_the_same_in_the_graph_as_in_process(play_graph):
+    # It looks around, is told to go at tick 10 and, having come there, once more at 48.
+    assert_equal_runs(play_graph, Stack(body="ant", look_around=10), Episodes(1, 5_000_003, difficulty=1), 55)
+
+
 def test_a_planner_that_looks_ahead_while_the_robot_moves_does_the_same(play_graph, oracles):
     thinking = Deliberation(thinking=2, look_ahead=30, per_tick=3)
     stack = Stack(oracles.choices | {"planner": Choice("planner")}, deliberation=thinking)
