@@ -159,7 +159,7 @@ class Stack:
             check_body(role, module, self.body)
         modules["planner"] = self.deliberation.prepare(modules["planner"], self.choices["planner"].source)
         ticks = self.look_around_ticks
-        scout = load_scout(self.scout.source, self.scout.weights, self.device) if ticks else None
+        scout = load_scout(self.scout.source, self.scout.weights, self.device, self.body) if ticks else None
         body = get_body(self.body)
         looking = {role: look_around(module, ticks, scout, body) for role, module in modules.items()}
         policy = SensePlanAct(**looking)  # pyright: ignore

@@ -70,27 +70,32 @@ def load_module(role: str, source: str = LEARNED, weights: Path | None = None, d
     return _make(role, _interface(role), source, weights, device)
 
 
-def check_body(role: str, module: Module, body: str) -> None:
+def check_body(role: str, module: Module | Scout, body: str) -> None:
     """Raise a `ValueError` if a learned module was trained for another body than the one that is played."""
     config = getattr(module, "config", {})
     trained = config.get("body") if isinstance(config, dict) else getattr(config, "body", None)
     if trained not in (None, body):
-        raise ValueError(f"the {role} was trained for the body {trained}: expected weights for {body}, or an oracle")
+        other = f"the {SCRIPTED} one" if role == SCOUT else "an oracle"
+        raise ValueError(f"the {role} was trained for the body {trained}: expected weights for {body}, or {other}")
 
 
-def load_scout(source: str, weights: Path | None = None, device: str = "cpu") -> Scout:
+def load_scout(source: str, weights: Path | None = None, device: str = "cpu", body: str | None = None) -> Scout:
     """Return what says where to look before pushing.
 
     Args:
         source: "scripted", "learned", the name of another entry point `scout.NAME`, or `package.module:Class`.
         weights: Weights of the learned one instead of those that ship.
         device: Device of the learned one.
+        body: The body that is played, if it is known.
 
     Raises:
         PluginError: If it is unknown, or no `Scout`.
-        ValueError: If weights are missing or damaged.
+        ValueError: If weights are missing, damaged or of another body.
     """
-    return _make(SCOUT, Scout, source, weights, device)
+    scout = _make(SCOUT, Scout, source, weights, device)
+    if body is not None:
+        check_body(SCOUT, scout, body)
+    return scout
 
 
 def _make(role: str, interface: type[Made], source: str, weights: Path | None, device: str) -> Made:

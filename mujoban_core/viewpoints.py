@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import BALL, Body
+from mujoban_core.camera import CameraMount
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, OFFSETS_XY, WALL, Instruction
 from mujoban_core.visibility import cells_in_view
 
@@ -26,8 +27,8 @@ FREE: Final = 0.3
 """Probability of a wall or a box up to which the robot dares to walk into a cell."""
 _WALK_COST: Final = 0.5
 """Cells of gain that one step of the way is worth by the rule."""
-TURN_HEADINGS: Final = 0.4 * math.pi * np.arange(5)
-"""Views that together make a turn, given the camera's 80 degrees."""
+_VIEWS_OF_A_TURN: Final = 5
+"""Views that together make a turn, of a camera of at least 72 degrees."""
 WALK_HEADINGS: Final = np.arctan2(OFFSETS_XY[:, 1], OFFSETS_XY[:, 0])
 """Direction of travel of each instruction in radians; that of STAY is not used."""
 _CELLS: Final = GRID_SIZE * GRID_SIZE
@@ -64,7 +65,7 @@ def survey(abstract_state: NDArray[np.float32], seen: NDArray[np.bool_], body: B
     gain = np.zeros(_CELLS, np.int64)
     if unknown.any():
         cells = np.flatnonzero(distance >= 0)
-        gain[cells] = (_views(wall, cells, body) & unknown.ravel()).sum(1)
+        gain[cells] = (_views(wall, cells, body, turn_headings(body.camera)) & unknown.ravel()).sum(1)
     return Survey._make(part.reshape(GRID_SIZE, GRID_SIZE) for part in (gain, distance, first))
 
 
@@ -84,10 +85,16 @@ def step_to_view(
     return Instruction(int(first[best])) if np.isfinite(worth[best]) else None
 
 
+def turn_headings(camera: CameraMount) -> NDArray[np.floating]:
+    """Return headings in radians whose views together make a turn, [at least 5]."""
+    views = max(_VIEWS_OF_A_TURN, math.ceil(360.0 / camera.fovy))
+    return 2.0 * math.pi / views * np.arange(views)
+
+
 def turn_view(abstract_state: NDArray[np.float32], body: Body = BALL) -> NDArray[np.bool_]:
     """Return which cells a turn in the robot's cell shows a body, by an estimate, [N, N] from [N, N, 4]."""
-    here = np.argmax(abstract_state[..., AGENT])
-    return _views(abstract_state[..., WALL], np.array([here]), body).reshape(GRID_SIZE, GRID_SIZE)
+    here, headings = np.argmax(abstract_state[..., AGENT]), turn_headings(body.camera)
+    return _views(abstract_state[..., WALL], np.array([here]), body, headings).reshape(GRID_SIZE, GRID_SIZE)
 
 
 def walk_view(
@@ -99,10 +106,7 @@ def walk_view(
 
 
 def _views(
-    wall: NDArray[np.float32],
-    cells: NDArray[np.int64],
-    body: Body,
-    headings: NDArray[np.floating] = TURN_HEADINGS,
+    wall: NDArray[np.float32], cells: NDArray[np.int64], body: Body, headings: NDArray[np.floating]
 ) -> NDArray[np.bool_]:
     """Return which cells are seen from each of `cells`, [V], with any of some headings, [V, N * N]."""
     half = (GRID_SIZE - 1) / 2

@@ -54,7 +54,7 @@ def cells_in_view(
     Args:
         wall: true walls, [N, 10, 10].
         pose: (x [m], y [m], psi [rad]) in the map frame, [N, 3].
-        mount: the body's camera.
+        mount: the body's camera, of which `forward` and `fovy` count.
         cell_size: edge of a cell in metres.
     """
     poses = np.array(pose, np.float64)

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mujoban_core.bodies import BALL
-from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction
+from mujoban_core.bodies import Body
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, WALL, Instruction, cell_to_xy
 from mujoban_core.look_around import WALKS
-from mujoban_core.viewpoints import TURN_HEADINGS, WALK_HEADINGS, survey
+from mujoban_core.viewpoints import WALK_HEADINGS, survey, turn_headings
 from mujoban_core.visibility import cells_in_view
 from mujoban_planner.uncertainty import BORDER, guesses, visible
 from mujoban_rl.engine import State
@@ -29,14 +29,18 @@ CHANNELS: Final = FIRST + 1
 _CHANGING: Final = ("level", "agent", "seen", "guess", "steps")
 
 
-def observe_estimate(abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> NDArray[np.float32]:
+def observe_estimate(
+    abstract_state: NDArray[np.float32], shown: NDArray[np.bool_], body: Body
+) -> NDArray[np.float32]:
     """Return what an explorer is told, [N, N, 8]: an estimate, which cells have been in view, what each cell promises.
 
     Args:
         abstract_state: Estimate, [N, N, 4].
         shown: Cells that have been in view, [N, N].
+        body: Carries the camera.
     """
-    return np.stack([*np.moveaxis(abstract_state, -1, 0), shown, *survey(abstract_state, shown)], -1).astype(np.float32)
+    promises = survey(abstract_state, shown, body)
+    return np.stack([*np.moveaxis(abstract_state, -1, 0), shown, *promises], -1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -70,16 +74,18 @@ class ExplorationEnvironment:
     """
 
     def __init__(
-        self, levels: NDArray[np.float32], rng: np.random.Generator, reward: ExplorationReward | None = None
+        self, levels: NDArray[np.float32], rng: np.random.Generator, body: Body, reward: ExplorationReward | None = None
     ) -> None:
         """Begin an episode in each level.
 
         Args:
             levels: Abstract states, [E, N, N, 4].
             rng: Source of the estimator's guesses.
+            body: Carries the camera.
             reward: Weights of the reward.
         """
-        self._rng, self._reward = rng, reward or ExplorationReward()
+        self._rng, self._body, self._reward = rng, body, reward or ExplorationReward()
+        self._turn = turn_headings(body.camera)
         batch = len(levels)
         self.level = np.zeros(levels.shape, np.bool_)
         """Abstract states as they are; the robot's layer is that of the start."""
@@ -100,15 +106,14 @@ class ExplorationEnvironment:
         self._look(rows)
 
     def _look(self, rows: NDArray[np.int64]) -> None:
-        turned = np.repeat(rows, len(TURN_HEADINGS))
-        view = self._view(turned, np.tile(TURN_HEADINGS, len(rows)))
-        self.seen[rows] |= view.reshape(len(rows), len(TURN_HEADINGS), GRID_SIZE, GRID_SIZE).any(1)
+        turned = np.repeat(rows, len(self._turn))
+        view = self._view(turned, np.tile(self._turn, len(rows)))
+        self.seen[rows] |= view.reshape(len(rows), len(self._turn), GRID_SIZE, GRID_SIZE).any(1)
 
     def _view(self, rows: NDArray[np.int64], heading: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return which cells a robot sees in its cell with a heading, [M, N, N]."""
-        half = (GRID_SIZE - 1) / 2
-        pose = np.stack([self.agent[rows, 1] - half, half - self.agent[rows, 0], heading], -1)
-        return cells_in_view(self.level[rows][..., WALL], pose, BALL.camera)
+        pose = np.concatenate([cell_to_xy(self.agent[rows], self._body.cell_size), heading[:, None]], -1)
+        return cells_in_view(self.level[rows][..., WALL], pose, self._body.camera, self._body.cell_size)
 
     @property
     def remaining(self) -> NDArray[np.int64]:
@@ -121,7 +126,7 @@ class ExplorationEnvironment:
         state[..., AGENT] = 0.0
         state[np.arange(len(state)), self.agent[:, 0], self.agent[:, 1], AGENT] = 1.0
         estimates = zip(state.astype(np.float32), self.seen, strict=True)
-        return np.stack([observe_estimate(estimate, shown) for estimate, shown in estimates])
+        return np.stack([observe_estimate(estimate, shown, self._body) for estimate, shown in estimates])
 
     def step(self, action: NDArray[np.int64]) -> ExplorationStep:
         """Execute an action in every level, [E]."""

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mujoban_core.bodies import Body, get_body
 from mujoban_core.grid import Instruction
 from mujoban_core.look_around import WALKS, Scout, ScriptedScout
 from mujoban_planner.boards import abstract_states
@@ -44,6 +45,8 @@ _STREAM: Final = 3
 class ExplorerConfig(PlayConfig):
     """What defines a run."""
 
+    body: str = "ball"
+    """Key in `mujoban_core.bodies.BODIES`: whose camera it is."""
     channels: int = 16
     blocks: int = 3
     horizon: float = 10.0
@@ -80,7 +83,8 @@ class ExplorerActor(SequenceActor):
         rng = np.random.default_rng([config.seed, _STREAM, stream])
         generator = torch.Generator().manual_seed(int(rng.integers(1 << 31)))
         super().__init__(config, self._explorer, generator)
-        self._environment = ExplorationEnvironment(self._draw(config.environments), rng, config.reward)
+        levels = self._draw(config.environments)
+        self._environment = ExplorationEnvironment(levels, rng, get_body(config.body), config.reward)
 
     @property
     def _parts(self) -> dict[str, Resumable]:
@@ -108,14 +112,16 @@ class ExplorerActor(SequenceActor):
         return {**kept, "terminated": step.complete, "dropped": cut}, {"reward": step.reward.tolist()}
 
 
-def judge_scout(scout: Scout, reward: ExplorationReward, levels: int, difficulty: int = 5) -> dict[str, float]:
-    """Let a scout explore validation levels; return averages over them.
+def judge_scout(
+    scout: Scout, reward: ExplorationReward, levels: int, body: Body, difficulty: int = 5
+) -> dict[str, float]:
+    """Let a scout of a body explore validation levels; return averages over them.
 
     `found` is the share of what can be seen and the first turn has not shown; `steps` and `looks` are the instructions
     of an episode, `reward` their return.
     """
     states = abstract_states(validation_levels(difficulty, levels))
-    environment = ExplorationEnvironment(states, np.random.default_rng(0), reward)
+    environment = ExplorationEnvironment(states, np.random.default_rng(0), body, reward)
     hidden, going = environment.remaining, np.ones(levels, np.bool_)
     left = hidden.copy()
     steps, looks, returns = np.zeros(levels), np.zeros(levels), np.zeros(levels)
@@ -146,8 +152,8 @@ class ExplorerLearner(DiscreteMPOLearner):
     def __init__(self, config: ExplorerConfig) -> None:
         """Build the network."""
         torch.manual_seed(config.seed)  # the initial weights
-        super().__init__(config, Explorer(config.channels, config.blocks))
-        self._reward = config.reward
+        super().__init__(config, Explorer(config.channels, config.blocks, config.body))
+        self._reward, self._body = config.reward, get_body(config.body)
         # What looks are worth differs by little, which a constant rate does not settle.
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up))
 
@@ -162,7 +168,8 @@ class ExplorerLearner(DiscreteMPOLearner):
 
     def evaluate(self) -> dict[str, float]:
         """Return what the target network gets to see of validation levels, and what the scripted scout does."""
-        learned, scripted = (judge_scout(scout, self._reward, _JUDGED) for scout in (self.target, ScriptedScout()))
+        scouts = self.target, ScriptedScout(self._body)
+        learned, scripted = (judge_scout(scout, self._reward, _JUDGED, self._body) for scout in scouts)
         return learned | {f"scripted/{name}": value for name, value in scripted.items()}
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_core.bodies import get_body
 from mujoban_core.grid import Instruction
 from mujoban_core.look_around import Scout
 from mujoban_planner.exploration_env import DISTANCE, FIRST, observe_estimate
@@ -49,10 +50,15 @@ class Explorer(nn.Module, Scout):
     whether it is worth the way, and where nothing is, it learns.
     """
 
-    def __init__(self, channels: int = 32, blocks: int = 4) -> None:
-        """Build the network."""
+    def __init__(self, channels: int = 32, blocks: int = 4, body: str = "ball") -> None:
+        """Build the network; it is told what the camera of a body would see.
+
+        Raises:
+            ValueError: If the body is unknown.
+        """
         super().__init__()
-        self.config = {"channels": channels, "blocks": blocks}
+        self.config = {"channels": channels, "blocks": blocks, "body": body}
+        self._body = get_body(body)
         self.encoder = nn.Conv2d(_PLANES, channels, 3, padding=1)
         self.blocks = nn.Sequential(*(ResidualBlock(channels) for _ in range(blocks)))
         self.places = nn.Conv2d(channels + _PLANES, 2 * len(ExplorerOutput._fields), 1)
@@ -78,7 +84,7 @@ class Explorer(nn.Module, Scout):
     @torch.inference_mode()
     def step(self, abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> Instruction | None:
         """Return the likeliest instruction, None where it is not worth its cost; see `Scout.step`."""
-        policy, q = self(torch.from_numpy(observe_estimate(abstract_state, shown))[None])
+        policy, q = self(torch.from_numpy(observe_estimate(abstract_state, shown, self._body))[None])
         best = int(policy.argmax())
         return Instruction(best) if q[0, best] > 0.0 else None
 

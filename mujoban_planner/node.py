@@ -92,7 +92,7 @@ class PlannerNode(ModuleNode[Planner]):
             source = declare(self, "scout", SCRIPTED, which)
             file = described("weights file of the learned scout; empty: those that ship", fixed=True)
             weights = declare(self, "scout_weights", "", file)
-            self._scout = load_scout(source, Path(weights) if weights else None)
+            self._scout = load_scout(source, Path(weights) if weights else None, body=self._body or None)
         return self._scout
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:

@@ -13,12 +13,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_core.bodies import BALL
+from mujoban_core.camera import CameraMount
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
 from mujoban_core.visibility import cells_in_view
 
 _VIEWS = 6
 """Most views that a hidden state is put together from."""
+_CAMERA = CameraMount(forward=0.15, height=0.0, pitch=0.0, fovy=80.0)
+"""What makes the views, in a world of cells of 1 m; of its figures forward and fovy count.
+
+A planner is of no body, and what few views leave unknown differs far more from state to state than between cameras
+(docs/research/planner.md).
+"""
 _COMPLETE = 0.5
 """Share of the hidden states in which all that can be seen was seen; of the rest there are a few views."""
 _UNSEEN = {WALL: (2.8, -1.0), TARGET: (-2.5, -5.0), BOX: (-2.2, -5.8)}
@@ -132,6 +138,6 @@ def _seen(state: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.bool
     x, y = cell % GRID_SIZE - half, half - cell // GRID_SIZE
     pose = np.stack([x, y, heading], -1).reshape(-1, 3)
     wall = np.repeat(state[..., WALL], _VIEWS, axis=0)
-    view = cells_in_view(wall, pose, BALL.camera).reshape(n, _VIEWS, GRID_SIZE, GRID_SIZE)
+    view = cells_in_view(wall, pose, _CAMERA).reshape(n, _VIEWS, GRID_SIZE, GRID_SIZE)
     count = rng.integers(1, _VIEWS + 1, (n, 1))
     return np.any(view & (np.arange(_VIEWS) < count)[..., None, None], axis=1) | BORDER

@@ -25,6 +25,7 @@ from mujoban_estimator.estimator import EstimatorConfig
 from mujoban_estimator.learner import LearnerConfig, TrainConfig
 from mujoban_estimator.termination import TerminationConfig
 from mujoban_estimator.train import Options, make_trainer
+from mujoban_planner.explorer import Explorer
 from mujoban_rl.weights import save_weights
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import TRAIN_SEEDS
@@ -65,7 +66,11 @@ def test_its_senses_and_its_camera_policy_are_trained_and_play_in_the_graph(teac
         "termination": Choice("termination", weights=tmp_path / "out/termination.safetensors"),
         "controller": Choice("controller", weights=tmp_path / "student/controller.safetensors"),
     }
-    graph = play_graph(Stack(oracles.choices | learned, body="cart"), Episodes(1, 0, difficulty=1), time_limit=30)
+    scout = tmp_path / "explorer.safetensors"
+    explorer = Explorer(8, 1, body="cart")
+    save_weights(scout, explorer, explorer.config, {})
+    stack = Stack(oracles.choices | learned, look_around=5, body="cart", scout=Choice("scout", weights=scout))
+    graph = play_graph(stack, Episodes(1, 0, difficulty=1), time_limit=30)
     (result,) = graph.finish()
     torques = np.array(list(graph.said.torque.values()))
     assert result.steps == len(torques) == 30 and torques.shape[1] == 2 and np.abs(torques).max() > 0

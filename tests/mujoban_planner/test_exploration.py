@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
 import numpy as np
 import pytest
 import torch
+from cart import CART
 
 from bringup import evaluate
+from mujoban_core.bodies import ANT, BALL, BODIES
 from mujoban_core.files import digest
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
 from mujoban_core.look_around import WALKS, LookAroundPlanner, Scout
+from mujoban_core.plugins import LEARNED, load_scout
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.exploration_env import SHOWN, ExplorationEnvironment, ExplorationReward
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore, judge_scout
@@ -41,7 +45,23 @@ CORNER = """
 @pytest.fixture
 def environment():
     states = abstract_states(stack_levels([Level.from_text(CORNER.strip())]))
-    return ExplorationEnvironment(states, np.random.default_rng(0), ExplorationReward(cell=1.0, move=0.25, look=0.5))
+    reward = ExplorationReward(cell=1.0, move=0.25, look=0.5)
+    return ExplorationEnvironment(states, np.random.default_rng(0), BALL, reward)
+
+
+def test_the_camera_of_the_body_says_what_comes_into_view():
+    states = abstract_states(stack_levels([Level.from_text(CORNER.strip())]))
+    narrow = dataclasses.replace(CART, camera=dataclasses.replace(CART.camera, fovy=20.0))
+    first, gained = {}, {}
+    for body in (ANT, CART, narrow):
+        environment = ExplorationEnvironment(states, np.random.default_rng(0), body)
+        first[body] = environment.seen.copy()
+        for _ in range(3):
+            environment.step(np.array([int(Instruction.EAST)]))
+        gained[body] = environment.seen.sum() - first[body].sum()
+    # The cart is as small as its cells and sees as wide as the ant; a narrow view makes a whole turn all the same.
+    assert gained[ANT] == gained[CART] > gained[narrow]
+    assert (first[ANT] == first[CART]).all() and (first[ANT] == first[narrow]).all()
 
 
 def test_what_lies_behind_walls_is_a_guess_until_it_comes_into_view(environment):
@@ -115,6 +135,16 @@ def test_runs_resume_to_the_bit_and_leave_an_explorer(tmp_path, monkeypatch):
     assert (tmp_path / "whole" / "explorer.safetensors").exists()
 
 
+def test_an_explorer_of_any_body_is_trained_and_scouts_for_that_body_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr("mujoban_planner.exploration_mpo._JUDGED", 4)
+    monkeypatch.setitem(BODIES, "cart", CART)
+    assert small(tmp_path, body="cart").run()
+    weights = tmp_path / "explorer.safetensors"
+    assert isinstance(load_scout(LEARNED, weights, body="cart"), Explorer)
+    with pytest.raises(ValueError, match="scout was trained for the body cart: expected weights for ball"):
+        load_scout(LEARNED, weights, body="ball")
+
+
 def test_a_batch_with_nan_is_refused(tmp_path):
     check_refusal(small(tmp_path), lambda batch: batch._replace(reward=batch.reward * math.nan))
 
@@ -129,10 +159,10 @@ def test_looking_pays_where_it_is_rewarded(monkeypatch):
             return Instruction.STAY
 
     reward = ExplorationReward()
-    assert judge_scout(Never(), reward, 4) == {"found": 0.0, "steps": 0.0, "looks": 0.0, "reward": 0.0}
+    assert judge_scout(Never(), reward, 4, BALL) == {"found": 0.0, "steps": 0.0, "looks": 0.0, "reward": 0.0}
     # Whoever never stops is stopped, also where all has been seen.
     monkeypatch.setattr(ExplorationEnvironment, "remaining", property(lambda self: np.zeros(4, np.int64)))
-    assert judge_scout(Turns(), reward, 4)["looks"] == WALKS
+    assert judge_scout(Turns(), reward, 4, BALL)["looks"] == WALKS
 
 
 def test_a_learned_scout_plays_and_is_named_by_its_weights(tmp_path):
