@@ -31,9 +31,10 @@ from mujoban_controller.drivers import ControllerDriver, Driver
 from mujoban_controller.policy import GoalPolicy
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_AXES, OFFSETS_XY, Instruction, turn_to_instruction
+from mujoban_core.grid import INSTRUCTION_AXES, OFFSETS_XY, Instruction, turn_to_instruction
 from mujoban_core.interfaces import Controller, ControllerInput, Memory
 from mujoban_rl.compiled import Compilable
+from mujoban_rl.dead_reckoning import displacement, map_velocity
 from mujoban_rl.networks import Gaussian, encode_frames, frame_encoder, gaussian, gaussian_layers, rows_of_sky
 from mujoban_rl.sight.orientation import NEEDLE, Compass, heading_of
 from mujoban_rl.sight.place import PLACE, Place, phases_along, way_left
@@ -79,7 +80,7 @@ def dead_reckoning(track: Tensor, velocity: Tensor, moved: Tensor, terminated: T
     Args:
         track: Before the tick, [B, 7]; zeros at an episode's start.
         velocity: In the map's frame in cells per second, [B, 2].
-        moved: What `displacement` says, [B, 2].
+        moved: Displacement since the tick before, [B, 2].
         terminated: Whether a new instruction begins with this tick, [B].
     """
     since, before, known = track[:, :2] + moved, track[:, 2:4], track[:, 6:]
@@ -87,19 +88,6 @@ def dead_reckoning(track: Tensor, velocity: Tensor, moved: Tensor, terminated: T
     before = torch.where(new, since, before)
     since = torch.where(new, torch.zeros_like(since), since)
     return torch.cat([since, before, velocity, torch.ones_like(known)], -1)
-
-
-def displacement(track: Tensor, velocity: Tensor, period: float) -> Tensor:
-    """Return how far a robot came since the tick before, [B, 2].
-
-    Args:
-        track: Before the tick, [B, 7].
-        velocity: In the map's frame in cells per second, [B, 2].
-        period: Seconds of a tick.
-    """
-    last, known = track[:, 4:6], track[:, 6:]
-    # Trapezoidal rule; an episode's first tick has nothing to come from.
-    return 0.5 * period * (velocity + last) * known
 
 
 class Sight(NamedTuple):
@@ -172,7 +160,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
                 a way to begin at.
         """
         super().__init__()
-        layout = get_body(body)
+        layout = self.layout = get_body(body)
         if way and not place:
             raise ValueError("way without place: how far it is follows from where it is; expected both")
         self.config = {
@@ -186,7 +174,6 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         self.proprio_size, self.action_size, self.hidden = layout.proprio_size, layout.action_size, hidden
         self.heading_index = layout.heading_index
         self.part = layout.proprio
-        self.cell_size = layout.cell_size
         self.register_buffer("axes", torch.tensor(INSTRUCTION_AXES, dtype=torch.float32), persistent=False)
         self.compass = Compass(layout, features) if self.heading_index is None else None
         self.register_buffer("steps", torch.tensor(OFFSETS_XY, dtype=torch.float32), persistent=False)
@@ -248,15 +235,21 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
         else:
             needles = [self.compass(shown.heading, proprio, track[:, _TRACK:_NEEDLE])]
             heading = heading_of(*needles)
-        ahead, left = (proprio[:, self.part.planar_velocity] / self.cell_size).split(1, -1)
-        velocity = torch.cat(turn_to_instruction(ahead, left, heading[:, :1], -heading[:, 1:]), -1)
-        moved = displacement(before, velocity, CONTROL_PERIOD)
+        velocity = map_velocity(self.layout, proprio, heading)
+        # An episode's first tick has nothing to come from.
+        moved = displacement(before[:, 4:6], velocity) * before[:, 6:]
         parts = [dead_reckoning(before, velocity, moved, terminated), *needles]
         if self.place is not None and shown.place is not None:
             parts.append(self.place(shown.place, heading, moved, track[:, -PLACE:]))
         return torch.cat(parts, -1)
 
-    def embed(self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor) -> Tensor:
+    def heading(self, track: Tensor) -> Tensor | None:
+        """Return the unit vectors in which robots face by their tracks, [..., 2]; None of a body that feels it."""
+        return None if self.compass is None else heading_of(track[..., _TRACK:_NEEDLE])
+
+    def embed(
+        self, proprio: Tensor, instruction: Tensor, terminated: Tensor, track: Tensor, heading: Tensor | None
+    ) -> Tensor:
         """Return the encoding of all inputs but the frame, [M, F].
 
         Args:
@@ -264,17 +257,17 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             instruction: A, int64 [M].
             terminated: beta, bool [M].
             track: Dead reckoning and what goes with it, [M, D].
+            heading: What `heading` says of it, [M, 2].
         """
         part = self.part
         normal = self._normal(proprio)
         # Shape [M, 1] each.
         x, y = (v[:, None] for v in self.axes[instruction].unbind(-1))
-        if self.compass is None:
+        if heading is None:
             angle = proprio[:, part.joint_position]
             parts = [normal[:, part.inertial], normal[:, part.joint_velocity], normal[:, part.up_axis]]
             parts += [angle.cos(), angle.sin(), *turn_to_instruction(angle.cos(), angle.sin(), x, y)]
         else:
-            heading = heading_of(track[:, _TRACK:_NEEDLE])
             parts = [normal, *turn_to_instruction(x, y, heading[:, :1], heading[:, 1:])]
         # Positions are clipped like the rest: a robot that is stuck for long must not drown everything else.
         parts += turn_to_instruction(track[:, 0:6:2].clamp(-3, 3), track[:, 1:6:2].clamp(-3, 3), x, y)
@@ -320,7 +313,8 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             track = self.reckon(proprio[:, i], terminated[:, i], past, shown.at(i))
             tracks.append(track)
         tracked = torch.stack(tracks, 1).flatten(0, 1)
-        felt = self.embed(proprio.flatten(0, 1), instruction.flatten(), terminated.flatten(), tracked)
+        heading = self.heading(tracked)
+        felt = self.embed(proprio.flatten(0, 1), instruction.flatten(), terminated.flatten(), tracked, heading)
         # Shape [B, T, F].
         mixed = self.mix(torch.cat([seen, felt], -1)).view(b, t, -1)
         outputs = []
@@ -329,7 +323,7 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
             outputs.append(h)
         features = torch.cat([torch.stack(outputs, 1), mixed], -1)
         tracked = tracked.view(b, t, -1)
-        heading = None if self.compass is None else heading_of(tracked[..., _TRACK:_NEEDLE])
+        heading = heading if heading is None else heading.view(b, t, -1)
         place = None if self.place is None else tracked[..., -PLACE:]
         return ControllerOutput(self.distribution(features), features, shown, heading, place, Recurrent(h, c, track))
 

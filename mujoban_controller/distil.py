@@ -253,7 +253,7 @@ class DistilLearner(ProductLearner[Batch]):
         frame = jitter_colours(batch["frame"], config.jitter, self._generator)
         inputs = (batch[name] for name in INPUT_FIELDS if name != "frame")
         output = student(frame, *inputs, memory_of(batch), batch["first"])
-        loss, stats = imitation_loss(output, self.head, batch, config, student.cell_size)
+        loss, stats = imitation_loss(output, self.head, batch, config, student.layout.cell_size)
         norm = guarded_step(loss, [self._adam], guard, clip=config.clip)
         if norm is not None:
             self._average.update_parameters(student)

@@ -334,7 +334,7 @@ class EstimatorLearner(Learner[Batch]):
         recurrence = self.termination.initial_recurrence(len(windows.stream))
         output = self.termination(looked, progress.features, proprio[at], *recurrence)
         direction = self._tensor(OFFSETS_XY[batch.instruction[at]].astype(np.float32))
-        phases = true_phases(self._tensor(batch.pose[at]), direction, self.termination.odometry.cell_size)
+        phases = true_phases(self._tensor(batch.pose[at]), direction, self.termination.odometry.body.cell_size)
         loss, parts = termination_loss(
             output.logits, output.phases, self._tensor(batch.completed[at]), phases,
             self._tensor(windows.valid).float(), place=self.config.place,
@@ -347,7 +347,7 @@ class EstimatorLearner(Learner[Batch]):
         if bearings is None:
             return ()
         first = windows.tick[:, 0]
-        cell = self.termination.odometry.cell_size
+        cell = self.termination.odometry.body.cell_size
         off = shard.off * np.array([_PLACE_OFF * cell, _PLACE_OFF * cell, _HEADING_OFF], np.float32)
         needles = bearings.pointing(self._tensor(batch.pose[windows.stream, first] + off))
         begins = self._tensor(batch.first[windows.stream] & (first == 0))

@@ -18,7 +18,9 @@ import torch
 from torch import Tensor
 
 from mujoban_core.bodies import Body
-from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_LIMIT, OFFSETS_XY, turn_to_instruction
+from mujoban_core.grid import INSTRUCTION_LIMIT, OFFSETS_XY, turn_to_instruction
+from mujoban_rl.dead_reckoning import displacement, map_velocity
+from mujoban_rl.sight.skyline import unit
 
 FEATURES: Final = 24
 """Features of a tick beside raw proprioception; see `Odometry.forward`."""
@@ -57,9 +59,9 @@ class Odometry:
 
     def __init__(self, body: Body) -> None:
         """Read a body's layout of proprioception."""
+        self.body = body
         self.heading = body.heading_index
         self.part = body.proprio
-        self.cell_size = body.cell_size
 
     def initial(self, batch: int, device: torch.device | str = "cpu") -> Track:
         """Return the track of robots at the centre of a cell at the start of an episode."""
@@ -93,9 +95,7 @@ class Odometry:
             heading: in the map frame, radians [B, T]; needed of a body that does not feel it.
         """
         psi = proprio[..., self.heading] if heading is None else heading
-        cos, sin = psi.cos(), psi.sin()
-        ahead, left = (proprio[..., self.part.planar_velocity] / self.cell_size).unbind(-1)
-        velocity = torch.stack([ahead * cos - left * sin, ahead * sin + left * cos], dim=-1)  # [B, T, 2]
+        velocity = map_velocity(self.body, proprio, unit(psi))
         offsets = torch.as_tensor(OFFSETS_XY, dtype=proprio.dtype, device=proprio.device)
         return _follow(track, velocity, offsets[instruction], terminated, psi)
 
@@ -108,14 +108,12 @@ class Odometry:
         """
         direction = track.direction
         stay = (direction == 0).all(dim=-1, keepdim=True)
-        psi = track.heading[..., None]
-        heading = torch.cat([psi.cos(), psi.sin()], dim=-1)
         target = turn(track.origin + direction - track.position, direction)
         home = turn(track.origin - track.position, direction)
         phase = 2 * math.pi * turn(track.position, direction)
         elapsed = track.elapsed[..., None]
         columns = [
-            turn(heading, direction),  # 2
+            turn(unit(track.heading), direction),  # 2
             turn(track.velocity, direction),  # 2
             self.part.turn_rate(proprio)[..., None] / 4,  # 1
             turn(track.position - track.start, direction).clamp(-2, 2),  # 2
@@ -153,7 +151,7 @@ def _follow(track: Track, velocity: Tensor, direction: Tensor, terminated: Tenso
     issued = torch.where(terminated, ticks, torch.zeros_like(ticks))
     if len(ticks) > 1:  # ONNX, in which single ticks are compiled, has no running maximum
         issued = issued.cummax(dim=1).values
-    steps = 0.5 * CONTROL_PERIOD * (_behind(track.velocity, velocity) + velocity)
+    steps = displacement(_behind(track.velocity, velocity), velocity)
     positions = torch.cat([track.position[:, None], steps], dim=1).cumsum(dim=1)
     before = _behind(track.direction, direction)
     origins = torch.round(positions[:, :-1] - _BEHIND * before)

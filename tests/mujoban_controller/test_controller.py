@@ -132,7 +132,7 @@ def test_dead_reckoning_follows_a_drive_round_a_corner(controller):
     ahead = torch.tensor([1.0] * 41 + [0.0] + [1.0] * 21)
     steer = torch.tensor([0.0] * 42 + [np.pi / 2] * 21)
     proprio = torch.zeros(len(ahead), BALL.proprio_size)
-    proprio[:, BALL.proprio.planar_velocity][:, 0] = ahead * controller.cell_size
+    proprio[:, BALL.proprio.planar_velocity][:, 0] = ahead * BALL.cell_size
     proprio[:, INERTIAL_SIZE + BALL.joints.index("steer")] = steer
     track = torch.zeros(1, 7)
     for t in range(len(ahead)):
