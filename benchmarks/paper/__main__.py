@@ -56,7 +56,9 @@ the stack that ships where a row begins with them. `--seed 1 --run runs/baseline
 once more. The commands are
 """
 FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
-where one begins, and the axes of rates are cut. The [model cards](../models/) have the scores of the weights that ship.
+where one begins, and the axes of rates are cut. The controller's began with weights of a run before. A sample of the
+planner is an evaluation of its network in the search that teaches it. The [model cards](../models/) have the scores of
+the weights that ship.
 """
 FIGURE_5 = """With ground-truth sense, as in the paper, but for the last row. The planner is the one that ships, and
 knows of no body.

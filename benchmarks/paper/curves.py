@@ -37,9 +37,9 @@ class Measure(NamedTuple):
 
 
 MEASURES: Final = {
-    "controller": (Measure(("instruction/move", "instruction/push"), "instructions completed"),),
+    "controller": (Measure(("instruction/move", "instruction/push"), "moves and pushes completed"),),
     "planner": (
-        Measure(("evaluation/success_rate/5",), "levels solved"),
+        Measure(("evaluation/success_rate/5",), "levels of difficulty 5 solved"),
         Measure(("train/accuracy",), "decisions right"),
     ),
     "estimator": (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +15,7 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.paper import runs as sources
 from benchmarks.paper.baselines import AGAIN, BASELINES, points_of
@@ -25,6 +27,8 @@ from mujoban_sim.presets import DEFAULT_WORLD
 _COLUMNS: Final = 4
 _VARIANTS: Final = {"mpo": "MPO alone, from nothing"}
 """Other ways to train a module, by the names of their files."""
+_SAMPLES: Final = {"controller": "ticks played", "planner": "samples"}
+"""What a module is trained on, in whose millions a curve is drawn; the others learn from recorded ticks."""
 
 
 def difficulty(runs: Sequence[Run], file: Path) -> bool:
@@ -63,7 +67,10 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
 
 def save_rates(figure: Figure, axes: Axes, file: Path) -> None:
     """Name the axes and bars of success against difficulty, write the figure and close it."""
-    axes.set(xlabel="difficulty", ylabel="success rate", ylim=(0, 1.02), xticks=range(1, 6))
+    lowest = max(0.0, math.floor(10.0 * axes.dataLim.y0) / 10.0 - 0.1)
+    axes.set(xlabel="difficulty", ylabel="success rate", ylim=(lowest, 1.0 + 0.02 * (1.0 - lowest)), xticks=range(1, 6))
+    axes.yaxis.set_major_formatter(lambda y, _: f"{100 * y:.4g} %")
+    axes.grid(alpha=0.3)
     title = "bars: 95 % intervals (Wilson)"
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", title=title, title_fontsize="small")
     figure.savefig(file, dpi=120)
@@ -117,13 +124,24 @@ def curves(file: Path) -> list[str]:
                 raise ResultError(f"{files[module]}: expected curves of one measure, not of {', '.join(sorted(what))}")
             if others:
                 axes.legend(fontsize="small", loc="center right")
-            axes.set(title=module, xlabel="million samples", ylabel=points[0]["what"])
-            if not points[0]["what"].startswith("loss"):
-                axes.yaxis.set_major_formatter(lambda y, _: f"{100 * y:.4g} %")
+            axes.set(title=module, xlabel=f"million {_SAMPLES.get(module, 'recorded ticks')}")
+            _name_values(axes, points[0]["what"])
             axes.grid(alpha=0.3)
         figure.savefig(file, dpi=110)
         plt.close(figure)
     return [module for module in MODULES if module not in found]
+
+
+def _name_values(axes: Axes, what: str) -> None:
+    """Say what a curve is of: a rate in percent, or a loss, of which the last part is not to vanish under the first."""
+    if not what.startswith("loss"):
+        axes.set_ylabel(what)
+        axes.yaxis.set_major_formatter(lambda y, _: f"{100 * y:.4g} %")
+        return
+    axes.set(ylabel=f"{what}\n[nats a tick, less is better]", yscale="log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def margins(report: dict[str, Any]) -> tuple[float, float]:

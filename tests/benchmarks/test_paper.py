@@ -346,9 +346,15 @@ def test_figures_name_their_axes_their_bars_and_each_curve_in_words(folder, draw
         (runs.JSON / f"curve_{name}.jsonl").write_text("".join(json.dumps(point) + "\n" for point in points))
     figures.curves(folder / "figure4.png")
     (axes,) = drawn()
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("million samples", "instructions completed")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("million ticks played", "instructions completed")
     assert words(axes) == ["supervised", "MPO alone, from nothing", "other way"]
     assert axes.yaxis.get_major_formatter()(0.5, 0) == "50 %"
+    losses = [{"step": 1000 * i, "value": 2.0**-i, "what": "loss of beta"} for i in range(4)]
+    (runs.JSON / "curve_termination.jsonl").write_text("".join(json.dumps(point) + "\n" for point in losses))
+    figures.curves(folder / "figure4.png")
+    _, axes = drawn()
+    assert axes.get_xlabel() == "million recorded ticks" and axes.get_yscale() == "log"
+    assert axes.get_ylabel() == "loss of beta\n[nats a tick, less is better]"
     (runs.JSON / "curve_controller_mpo.jsonl").write_text('{"step": 0, "value": 1.5, "what": "loss"}\n')
     with pytest.raises(runs.ResultError, match=r"curve_controller\.jsonl: expected curves of one measure"):
         figures.curves(folder / "figure4.png")
