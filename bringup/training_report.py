@@ -18,6 +18,7 @@ from bringup.model_card import Place, Score, card
 from bringup.pipeline import Pipeline
 from mujoban_core.files import write_atomically
 from mujoban_core.text import readable
+from mujoban_rl.metrics import read_metrics
 from mujoban_sokoban.generator import FRESH_SEEDS
 
 _PREFIX = "evaluation/"
@@ -65,11 +66,10 @@ def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> P
     return path
 
 
-def read_curves(metrics: Path) -> dict[str, list[tuple[float, float]]]:
-    """Return the curves of a run's `metrics.jsonl`: pairs of CPU seconds and score, by the score's name."""
+def read_curves(run: Path) -> dict[str, list[tuple[float, float]]]:
+    """Return the curves of a training's `metrics.jsonl`: pairs of CPU seconds and score, by the score's name."""
     curves: dict[str, list[tuple[float, float]]] = {}
-    for line in metrics.read_text().splitlines():
-        values = json.loads(line)
+    for values in read_metrics(run):
         for name, value in values.items():
             if name.startswith(_PREFIX) and value is not None:
                 curves.setdefault(name.removeprefix(_PREFIX), []).append((values["cpu_seconds"], value))
@@ -78,7 +78,7 @@ def read_curves(metrics: Path) -> dict[str, list[tuple[float, float]]]:
 
 def draw_curves(run: Path, names: list[str], path: Path) -> bool:
     """Draw the validation curves of all trainings, one panel each; return whether there are any."""
-    found = {name: curves for name in names if (curves := _rates(run / name / "metrics.jsonl"))}
+    found = {name: curves for name in names if (curves := _rates(run / name))}
     if not found:
         return False
     figure, axes = plt.subplots(1, len(found), figsize=(4.2 * len(found), 3.4), squeeze=False)
@@ -94,11 +94,11 @@ def draw_curves(run: Path, names: list[str], path: Path) -> bool:
     return True
 
 
-def _rates(metrics: Path) -> dict[str, list[tuple[float, float]]]:
+def _rates(run: Path) -> dict[str, list[tuple[float, float]]]:
     """Return the curves that are drawn."""
-    if not metrics.exists():
+    if not (run / "metrics.jsonl").exists():
         return {}
-    return {name: points for name, points in read_curves(metrics).items() if name.startswith(_RATES)}
+    return {name: points for name, points in read_curves(run).items() if name.startswith(_RATES)}
 
 
 def cost(run: Path) -> dict[str, float]:

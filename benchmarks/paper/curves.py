@@ -20,6 +20,7 @@ import numpy as np
 from benchmarks.paper.runs import JSON, ResultError
 from mujoban_core.files import write_atomically
 from mujoban_core.program import read_options, run_command
+from mujoban_rl import metrics
 
 MODULES: Final = ("controller", "planner", "estimator", "termination")
 _FEWEST: Final = 3
@@ -98,10 +99,9 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
         ResultError: If that is missing or damaged.
     """
     try:
-        return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    except (OSError, json.JSONDecodeError) as error:
-        why = "no metrics.jsonl" if isinstance(error, OSError) else f"metrics.jsonl: {error}"
-        raise ResultError(f"{run}: {why}, expected the run directory of a trainer") from error
+        return metrics.read_metrics(run)
+    except ValueError as error:
+        raise ResultError(str(error)) from error
 
 
 def _value(line: dict[str, Any], measure: Measure) -> tuple[float, float] | None:

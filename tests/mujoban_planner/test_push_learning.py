@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from mujoban_planner.boards import abstract_states, bit_boards
-from mujoban_planner.curves import read_curve
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.push_actor import PlayConfig
 from mujoban_planner.push_env import PUSHES
@@ -13,6 +12,7 @@ from mujoban_planner.push_mpo import PushMPOConfig, PushReplay, push_mpo
 from mujoban_planner.push_policy import Anchor, PushPolicy, images
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
 from mujoban_rl.actors import Experience
+from mujoban_rl.curves import read_curve
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.run_directory import RunError
@@ -219,5 +219,5 @@ def test_curves_are_drawn_against_samples_and_cpu_time(tmp_path):
     trainer = ppo(tmp_path)
     trainer.learner.evaluate = lambda: {"success_rate/5": 0.25}
     trainer.run()
-    ((samples, cpu_seconds, rate),) = read_curve(tmp_path, 5)
+    ((samples, cpu_seconds, rate),) = read_curve(tmp_path, "evaluation/success_rate/5")
     assert samples == 6 * 16 * 4 and cpu_seconds == trainer.progress.cpu_seconds > 0.0 and rate == 0.25

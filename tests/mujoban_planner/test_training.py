@@ -19,7 +19,6 @@ from mujoban_msgs_py.bags.training import EpisodeTick
 from mujoban_msgs_py.conversions import InstructionReading
 from mujoban_planner import bag_transitions, train
 from mujoban_planner.boards import abstract_states
-from mujoban_planner.curves import read_curve
 from mujoban_planner.decision import count_visits, initial_means, initial_visits
 from mujoban_planner.growth import start_from
 from mujoban_planner.imitation import ImitationConfig, imitation, imitation_loss
@@ -30,6 +29,7 @@ from mujoban_planner.reinforcement import MPOConfig, MPOLearner, reinforcement, 
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_rl.actors import ActorOptions
+from mujoban_rl.curves import read_curve
 from mujoban_rl.engine import Cadence
 from mujoban_rl.run_directory import RunError
 from mujoban_rl.testing import check_refusal, check_resuming
@@ -269,7 +269,7 @@ def test_evaluations_by_samples_begin_before_training(tmp_path):
     small = ["--channels", "8", "--blocks", "1", "--batch-size", "16", "--levels", "16", "--stock", "4"]
     often = ["--actors", "local", "--evaluate-samples", "32", "--samples", "80"]
     assert train.main(["imitation", "--run", str(tmp_path), *small, *often]) == 0
-    assert [samples for samples, *_ in read_curve(tmp_path, 1)] == [0, 32, 64, 80]
+    assert [samples for samples, *_ in read_curve(tmp_path, "evaluation/success_rate/1")] == [0, 32, 64, 80]
 
 
 @pytest.mark.parametrize("method", ["imitation", "expert-iteration", "ppo", "mpo", "mpo-pushes", "stages", "explorer"])
