@@ -19,11 +19,12 @@ from mujoban_core.ranges import check_counts, check_positive
 from mujoban_planner.boards import BitBoards
 from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.push_policy import PushPolicy
-from mujoban_planner.training_levels import Ticket, TrainingLevels, stream_number
+from mujoban_planner.training_levels import LevelConfig, Ticket, TrainingLevels, stream_number
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
 from mujoban_rl.precision import autocast
+from mujoban_sokoban.bitboard import SQUARES
 
 BOARDS = BitBoards._fields
 STEP = ("push", "reward", "terminated", "truncated")
@@ -31,7 +32,7 @@ STEP = ("push", "reward", "terminated", "truncated")
 
 
 @dataclass(frozen=True)
-class PlayConfig:
+class PlayConfig(LevelConfig):
     """What defines how an actor plays."""
 
     environments: int = 256
@@ -43,6 +44,7 @@ class PlayConfig:
 
     def __post_init__(self) -> None:
         """Reject numbers with which nothing is played or learned."""
+        super().__post_init__()
         check_counts(self, "environments", "steps")
         check_positive(self, "reward_scale")
 
@@ -70,10 +72,12 @@ class PushActor(Actor):
         number = stream_number(seed, stream)
         self.policy, self.config = PushPolicy(network.build(), untaught=True).eval(), config
         self.policy.planner.lay_out()
-        self._levels = TrainingLevels(number)
+        self._levels = TrainingLevels(number, config)
         self._generator = torch.Generator().manual_seed(number)
         self._environment = PushEnvironment(config.environments)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.environments
+        self._ways: list[list[int]] = [[] for _ in range(config.environments)]
+        """Pushes in each level so far, as tickets have them."""
         self._reset(np.arange(config.environments))
 
     def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
@@ -85,13 +89,16 @@ class PushActor(Actor):
         """Play T pushes in every level."""
         config, environment = self.config, self._environment
         seen: dict[str, list[NDArray[Any]]] = {name: [] for name in (*BOARDS, *STEP, "log_prob")}
-        statistics: dict[str, list[float]] = {f"solved/{d}": [] for d in DIFFICULTIES} | {"moves_per_push": []}
+        statistics: dict[str, list[float]] = {f"solved/{d}": [] for d in (*DIFFICULTIES, "mined", "long")}
+        statistics["moves_per_push"] = []
         for _ in range(config.steps):
             with autocast("cpu"):
                 log_policy = self.policy(environment.boards).logits.log_softmax(1)
             push = torch.multinomial(log_policy.exp(), 1, generator=self._generator)
             before = {name: column.copy() for name, column in environment.boards._asdict().items()}
             step = environment.step(push[:, 0].numpy())
+            for way, pushed in zip(self._ways, push[:, 0].tolist(), strict=True):
+                way.append(4 * (pushed % SQUARES) + pushed // SQUARES)
             chosen = log_policy.gather(1, push)[:, 0].numpy()
             reward = step.reward * np.float32(config.reward_scale)
             values = (push[:, 0].numpy(), reward, step.terminated, step.truncated, chosen)
@@ -102,7 +109,9 @@ class PushActor(Actor):
             for row in over.tolist():
                 ticket, solved = self._tickets[row], bool(step.solved[row])
                 self._levels.rate(ticket, solved)
-                statistics[f"solved/{ticket.difficulty}"].append(solved)
+                if solved:
+                    self._levels.solved_by(ticket, self._ways[row])
+                statistics[f"solved/{ticket.kind}"].append(solved)
             self._reset(over)
         arrays = {name: np.stack(values) for name, values in seen.items()}
         arrays |= {f"last_{name}": column.copy() for name, column in environment.boards._asdict().items()}
@@ -115,17 +124,20 @@ class PushActor(Actor):
             boards, tickets = self._levels.draw(len(rows))
             self._environment.reset_to(rows, boards)
             for row, ticket in zip(rows.tolist(), tickets, strict=True):
-                self._tickets[row] = ticket
+                self._tickets[row], self._ways[row] = ticket, []
 
     def state(self) -> State:
         """Return levels and random states."""
-        own = State({"tickets": [list(ticket) for ticket in self._tickets]}, {"generator": self._generator.get_state()})
+        values = {"tickets": [ticket.values for ticket in self._tickets], "ways": [list(way) for way in self._ways]}
+        own = State(values, {"generator": self._generator.get_state()})
         return State.of({"own": own, "levels": self._levels.state(), "environment": self._environment.state()})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         own = state.part("own")
-        self._tickets = [Ticket(*ticket) for ticket in own.values["tickets"]]
+        self._tickets = [Ticket.of(ticket) for ticket in own.values["tickets"]]
+        # Runs that began before long levels came again have none, and no use for them.
+        self._ways = [list(way) for way in own.values.get("ways", self._ways)]
         self._generator.set_state(own.tensors["generator"])
         self._levels.restore(state.part("levels"))
         self._environment.restore(state.part("environment"))

@@ -32,7 +32,7 @@ from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, m
 from mujoban_planner.search import GraphedEvaluation, evaluate_boards, grow
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import DEAD_SHARE, judge_instructions, label_dead, label_demonstrations, possible_pushes
-from mujoban_planner.training_levels import Ticket, TrainingLevels, stream_number
+from mujoban_planner.training_levels import LevelConfig, Ticket, TrainingLevels, stream_number
 from mujoban_planner.uncertainty import blur, hide_unseen
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Actor, Experience
@@ -47,7 +47,7 @@ _NO_BOARDS: Final = BitBoards(_NONE, _NONE, _NONE, np.zeros(0, np.uint8))
 
 
 @dataclass(frozen=True)
-class SearchConfig:
+class SearchConfig(LevelConfig):
     """What defines searches, and the batches of what they taught."""
 
     trees: int = 256
@@ -60,8 +60,6 @@ class SearchConfig:
     """How often a level that was not solved comes again."""
     retried: float = 0.15
     """Share of such levels."""
-    mined: float = 0.0
-    """Share of levels that own play lost when they first came; they come until it has won each several times."""
     steps: int = 8
     """Steps of every search that are delivered at once."""
     walks: float = 0.25
@@ -86,9 +84,10 @@ class SearchConfig:
 
     def __post_init__(self) -> None:
         """Reject what is no number of its kind, and no share."""
+        super().__post_init__()
         check_counts(self, "trees", "expansions", "steps", "buffer", "batch_size")
         check_counts(self, "questions", "retries", "lead", "verdicts", least=0)
-        check_shares(self, "retried", "mined", "walks", "led", "judged", "easy", "noise", "hidden")
+        check_shares(self, "retried", "walks", "led", "judged", "easy", "noise", "hidden")
 
 
 @dataclass
@@ -128,7 +127,7 @@ class SearchActor(Actor):
         number = stream_number(seed, stream)
         self.planner, self.config = network.build().eval().to(device), config
         self.planner.lay_out()
-        self._levels = TrainingLevels(number, retried=config.retried, retries=config.retries, mined=config.mined)
+        self._levels = TrainingLevels(number, config, retried=config.retried, retries=config.retries)
         self._forest = Forest(config.trees, (config.expansions << config.retries) + config.questions, MOVE_LIMIT)
         self._budgets = np.zeros(config.trees, np.int64)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.trees
@@ -144,7 +143,7 @@ class SearchActor(Actor):
         """Let every search take so many steps."""
         lessons: dict[str, list[Samples]] = {"way": [unlabelled(_NO_BOARDS)], "verdict": [unlabelled(_NO_BOARDS)]}
         ended: dict[str, list[bool]] = {f"{kind}/{d}": [] for kind in ("play", "search") for d in DIFFICULTIES}
-        ended["play/mined"] = []
+        ended |= {"play/mined": [], "play/long": []}
         for _ in range(self.config.steps):
             self._advance(lessons, ended)
         kept = {kind: self._prioritise(concatenate(parts)) for kind, parts in lessons.items()}
@@ -156,7 +155,7 @@ class SearchActor(Actor):
     def state(self) -> State:
         """Return levels, trees and random state."""
         leads = [[lead.playing, lead.won, [list(state) for state in lead.states]] for lead in self._leads]
-        tickets = [list(ticket) for ticket in self._tickets]
+        tickets = [ticket.values for ticket in self._tickets]
         values = {"rng": self._rng.bit_generator.state, "tickets": tickets, "leads": leads}
         own = State(values, {"budgets": torch.from_numpy(self._budgets)})
         return State.of({"own": own, "levels": self._levels.state(), "forest": self._forest.state()})
@@ -168,7 +167,7 @@ class SearchActor(Actor):
         self._budgets[:] = state.part("own").tensors["budgets"].numpy()
         own = state.part("own").values
         self._rng.bit_generator.state = own["rng"]
-        self._tickets = [Ticket(*ticket) for ticket in own["tickets"]]
+        self._tickets = [Ticket.of(ticket) for ticket in own["tickets"]]
         self._leads = [_Lead(playing, won, [(x, y, z) for x, y, z in way]) for playing, won, way in own["leads"]]
 
     def _advance(self, lessons: dict[str, list[Samples]], ended: dict[str, list[bool]]) -> None:
@@ -179,10 +178,12 @@ class SearchActor(Actor):
             searched = [row for row in over.tolist() if forest.trees.nodes[row] and not self._leads[row].won]
             for row in searched:
                 ticket, solved = self._tickets[row], bool(forest.trees.solution[row] >= 0)
+                if solved:
+                    self._levels.solved_by(ticket, self._pushes(row))
                 if not self._leads[row].states:
                     if not solved:
                         self._levels.come_again(ticket)
-                    if ticket.failures == 0:
+                    if ticket.failures == 0 and not ticket.long:
                         ended[f"search/{ticket.difficulty}"].append(solved)
             self._learn(searched, lessons)
             boards, tickets = self._levels.draw(len(over))
@@ -243,11 +244,16 @@ class SearchActor(Actor):
         lead, ticket = self._leads[row], self._tickets[row]
         lead.playing, lead.won = False, won
         self._levels.rate(ticket, won)
-        ended["play/mined" if ticket.mined else f"play/{ticket.difficulty}"].append(won)
+        ended[f"play/{ticket.kind}"].append(won)
         if won:
+            self._levels.solved_by(ticket, self._pushes(row))
             self._budgets[row] = 0
         else:
             self._go_back(row, lead)
+
+    def _pushes(self, row: int) -> list[int]:
+        """Return the pushes from where a level began to the end of the way that a search found."""
+        return [push for _, _, push in self._leads[row].states] + self._forest.solution(row).tolist()
 
     def _go_back(self, row: int, lead: _Lead) -> None:
         """Begin the search of a level that own play has lost: at its start, or somewhere on the way that it took."""

@@ -1,20 +1,28 @@
-"""Fresh training levels, of the difficulties at which there is most to learn.
+"""Training levels of methods without a solver, of the difficulties at which there is most to learn.
+
+Beside fresh levels others come again: those that own play or search lost, and those whose own solution is long, from
+their start and from along that solution.
 
 Shapes: R levels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.ranges import check_counts, check_shares
 from mujoban_planner.boards import BitBoards, bit_boards
+from mujoban_planner.shortening import shorten
 from mujoban_rl.engine import State
+from mujoban_sokoban.bitboard import pushed
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
+from mujoban_sokoban.solver_labels import count_moves
 
 _STREAMS_PER_SEED: Final = 1000
 """Streams of levels that one seed may use up, one for each actor."""
@@ -30,8 +38,9 @@ _MASTERED: Final = 0.6
 _LATE_SHARE: Final = 0.9
 """Share of the hardest difficulty then; the one below it has the rest."""
 _KEPT_FAILURES: Final = 20_000
+_KEPT_LONG: Final = 4096
 _LEAVES: Final = 0.1
-"""Chance that a level which was lost at first is not drawn any more once it is won."""
+"""Chance that a level which was lost at first is not drawn any more once it is won; and a long one whenever it is."""
 _STREAMS: Final = TRAIN_SEEDS.start + 700_000 * _SEEDS_PER_STREAM
 LAST_SEED: Final = (TRAIN_SEEDS.stop - _STREAMS) // (_STREAMS_PER_SEED * _SEEDS_PER_STREAM) - 1
 """The largest seed of a run whose every stream has levels."""
@@ -48,6 +57,25 @@ def stream_number(seed: int, stream: int) -> int:
     return _STREAMS_PER_SEED * seed + stream
 
 
+@dataclass(frozen=True)
+class LevelConfig:
+    """What decides which levels come again."""
+
+    mined: float = 0.0
+    """Share of levels that own play lost when they first came; they come until it has won each several times."""
+    long: float = 0.0
+    """Share of the other levels whose own solution is long; each comes about ten times."""
+    long_moves: int = 45
+    """Moves from which on a solution is long, in the best order of its pushes."""
+    restarted: float = 0.5
+    """Share of these that begin somewhere along that solution; the others begin at their start."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no share, and no number of moves."""
+        check_shares(self, "mined", "long", "restarted")
+        check_counts(self, "long_moves")
+
+
 class Ticket(NamedTuple):
     """A level that is being played; it is generated again from what stands here."""
 
@@ -57,25 +85,47 @@ class Ticket(NamedTuple):
     """How often it was tried in vain before."""
     mined: bool = False
     """Whether it comes again because it was lost at first."""
+    long: bool = False
+    """Whether it comes again because its own solution is long."""
+    done: tuple[int, ...] = ()
+    """Pushes after which it begins, 4 * square + direction of the box."""
+
+    @property
+    def kind(self) -> str:
+        """`mined` or `long`, or the difficulty of a level that does not come again for that."""
+        return "mined" if self.mined else "long" if self.long else str(self.difficulty)
+
+    @property
+    def values(self) -> list[Any]:
+        """What stands here, as JSON values."""
+        return [*self[:-1], list(self.done)]
+
+    @classmethod
+    def of(cls, values: Iterable[Any]) -> Ticket:
+        """Return a ticket from its `values`."""
+        ticket = cls(*values)
+        return ticket._replace(done=tuple(ticket.done))
 
 
 class TrainingLevels:
     """A stream of levels whose mix follows the solve rates that are reported.
 
     A difficulty weighs as much as its outcome is uncertain, r (1 - r) for a solve rate r. Levels that were not solved
-    come again, and so do those that were lost at the first try: a good planner meets few levels that are hard for it
-    otherwise. Boxoban's medium levels were chosen likewise, by what a planner lost (Guez et al. 2019).
+    come again, and so do those that were lost at the first try and those whose own solution is long: a good planner
+    meets few levels that are hard for it otherwise. Boxoban's medium levels were chosen likewise, by what a planner
+    lost (Guez et al. 2019).
     """
 
-    def __init__(self, stream: int, *, retried: float = 0.0, retries: int = 0, mined: float = 0.0) -> None:
+    def __init__(
+        self, stream: int, config: LevelConfig | None = None, *, retried: float = 0.0, retries: int = 0
+    ) -> None:
         """Draw from the training seeds and randomness of a stream.
 
         Args:
             stream: 0, 1, ...; different streams share no level.
+            config: Which come again, while there are such; by default none.
             retried: Share of levels that were tried in vain before, while there are some.
-            retries: How often a level comes again.
-            mined: Share of levels that were lost at the first try, while there are some; each is drawn until it has
-                been won several times.
+            retries: How often such a level comes again.
 
         Raises:
             ValueError: If the stream has no training seeds.
@@ -84,10 +134,11 @@ class TrainingLevels:
         if stream < 0 or self._next + _SEEDS_PER_STREAM - 1 not in TRAIN_SEEDS:
             raise ValueError(f"stream {stream}: expected a number whose seeds lie in {TRAIN_SEEDS}, as of a small seed")
         self._rng = np.random.default_rng([stream, 3])
-        self._retried, self._retries, self._mined = retried, retries, mined
+        self._config, self._retried, self._retries = config or LevelConfig(), retried, retries
         self._solved, self._tried = np.zeros((2, len(DIFFICULTIES)))
         self._failed: list[Ticket] = []
         self._lost: list[Ticket] = []
+        self._long: list[Ticket] = []  # with the whole solution in `done`
 
     @property
     def success_rates(self) -> NDArray[np.float64]:
@@ -115,24 +166,40 @@ class TrainingLevels:
         for difficulty in difficulties:
             if self._failed and self._rng.random() < self._retried:
                 tickets.append(self._pop(self._failed))
-            elif self._mined and self._lost and self._rng.random() < self._mined:
+            elif self._config.mined and self._lost and self._rng.random() < self._config.mined:
                 tickets.append(self._pop(self._lost))
+            elif self._config.long and self._long and self._rng.random() < self._config.long:
+                tickets.append(self._draw_long())
             else:
                 tickets.append(Ticket(difficulty, self._next, 0))
                 self._next += 1
         return _boards(tickets), tickets
 
     def rate(self, ticket: Ticket, solved: bool) -> None:
-        """Take note of how a level ended at the first try, or of one that is mined at another."""
-        if self._mined and not (solved and (not ticket.mined or self._rng.random() < _LEAVES)):
-            self._lost.append(ticket._replace(mined=True))
-            if len(self._lost) > _KEPT_FAILURES:
-                self._pop(self._lost)
-        if ticket.mined:
+        """Take note of how a level ended at the first try, or of one that came again for itself at another."""
+        if self._config.mined and not (solved and (not ticket.mined or self._rng.random() < _LEAVES)):
+            self._keep(self._lost, ticket._replace(mined=True), _KEPT_FAILURES)
+        if ticket.mined or ticket.long:
             return
         i = list(DIFFICULTIES).index(ticket.difficulty)
         self._solved[i] = _MEMORY * self._solved[i] + solved
         self._tried[i] = _MEMORY * self._tried[i] + 1.0
+
+    def solved_by(self, ticket: Ticket, pushes: Sequence[int]) -> None:
+        """Take note of a solution that was found, which makes the level come again if it is long.
+
+        Args:
+            ticket: The level.
+            pushes: From its start, 4 * square + direction of the box.
+        """
+        if not self._config.long or ticket.mined or ticket.long:
+            return
+        level = generate_batch(ticket.difficulty, [ticket.seed])
+        wall, _, box, agent = (column[0] for column in bit_boards(level))
+        way, moves = shorten(wall, box, agent, np.array(pushes, np.uint8)), np.zeros(1, np.int64)
+        count_moves(level.wall, level.boxes, level.player, way, np.array([0, len(way)]), moves)
+        if moves[0] >= self._config.long_moves:
+            self._keep(self._long, ticket._replace(failures=0, long=True, done=tuple(way.tolist())), _KEPT_LONG)
 
     def come_again(self, ticket: Ticket) -> None:
         """Draw a level that was tried in vain again, unless that was its last time."""
@@ -142,7 +209,7 @@ class TrainingLevels:
     def state(self) -> State:
         """Return all that changes."""
         rates = {"solved": self._solved.tolist(), "tried": self._tried.tolist()}
-        waiting = {"failed": [list(x) for x in self._failed], "lost": [list(x) for x in self._lost]}
+        waiting = {name: [ticket.values for ticket in tickets] for name, tickets in self._waiting.items()}
         return State({"next": self._next, "rng": self._rng.bit_generator.state, **waiting, **rates})
 
     def restore(self, state: State) -> None:
@@ -150,9 +217,29 @@ class TrainingLevels:
         values = state.values
         self._next = values["next"]
         self._rng.bit_generator.state = values["rng"]
-        # Runs that began before levels were mined have none.
-        self._failed, self._lost = ([Ticket(*x) for x in values.get(name, ())] for name in ("failed", "lost"))
+        # Runs that began before levels were mined, or were long, have none.
+        for name, tickets in self._waiting.items():
+            tickets[:] = [Ticket.of(x) for x in values.get(name, ())]
         self._solved, self._tried = np.array(values["solved"]), np.array(values["tried"])
+
+    @property
+    def _waiting(self) -> dict[str, list[Ticket]]:
+        """Levels that come again, by why."""
+        return {"failed": self._failed, "lost": self._lost, "long": self._long}
+
+    def _draw_long(self) -> Ticket:
+        """Return a level with a long solution, from its start or from somewhere along that."""
+        ticket = self._pop(self._long)
+        if self._rng.random() >= _LEAVES:
+            self._long.append(ticket)
+        along = len(ticket.done) > 1 and self._rng.random() < self._config.restarted
+        return ticket._replace(done=ticket.done[: self._rng.integers(1, len(ticket.done))] if along else ())
+
+    def _keep(self, tickets: list[Ticket], ticket: Ticket, most: int) -> None:
+        """Add a ticket; where there are too many, whichever leaves."""
+        tickets.append(ticket)
+        if len(tickets) > most:
+            self._pop(tickets)
 
     def _pop(self, tickets: list[Ticket]) -> Ticket:
         """Take one of them out, whichever."""
@@ -168,4 +255,8 @@ def _boards(tickets: Sequence[Ticket]) -> BitBoards:
         levels = generate_batch(d, [tickets[row].seed for row in rows.tolist()])
         for column, values in zip(boards, bit_boards(levels), strict=True):
             column[rows] = values
+    for row, ticket in enumerate(tickets):
+        for push in ticket.done:
+            boards.box[row] = pushed(boards.box[row], push // 4, push % 4)
+            boards.agent[row] = push // 4
     return boards

@@ -17,7 +17,7 @@ from mujoban_planner.samples import Samples, concatenate
 from mujoban_planner.search import evaluate_boards, grow
 from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
 from mujoban_planner.teacher import reachable_pushes
-from mujoban_planner.training_levels import TrainingLevels
+from mujoban_planner.training_levels import LevelConfig, TrainingLevels
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Experience
 from mujoban_rl.engine import Cadence
@@ -177,7 +177,7 @@ def test_levels_that_were_not_solved_come_again_and_the_mix_follows_what_is_solv
 
 
 def test_levels_that_were_lost_at_first_come_until_they_have_been_won_several_times():
-    levels = TrainingLevels(0, mined=0.5)
+    levels = TrainingLevels(0, LevelConfig(mined=0.5))
     lost, won = levels.draw(2)[1]
     levels.rate(lost, solved=False)
     levels.rate(won, solved=True)
