@@ -126,7 +126,7 @@ def test_a_solution_is_as_long_as_in_the_best_order_of_its_pushes(solved):
 @pytest.mark.parametrize("kind", ["search", "pushes"])
 def test_actors_bring_long_and_lost_levels_again(kind):
     player = actor(kind)
-    ended = [player.act().statistics for _ in range(24)]
+    ended = [player.act().statistics for _ in range(12)]
     word = "play" if kind == "search" else "solved"
     tries = {name: np.concatenate([found[f"{word}/{name}"] for found in ended]) for name in ("mined", "long")}
     assert len(tries["mined"]) > 10 and len(tries["long"]) > 10
