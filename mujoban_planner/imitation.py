@@ -84,7 +84,8 @@ class ImitationConfig(LessonConfig, LearnerConfig):
 
     def __post_init__(self) -> None:
         """Reject what is no share, a budget of nothing, and levels that are hardly found."""
-        super().__post_init__()
+        LessonConfig.__post_init__(self)
+        LearnerConfig.__post_init__(self)
         check_positive(self, "cpu_seconds")
         if not 0.0 < self.bag_share <= 1.0:
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")

@@ -19,7 +19,7 @@ from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.training_levels import stream_number
-from mujoban_planner.uncertainty import blur, hide_unseen
+from mujoban_planner.uncertainty import Uncertainty, UncertaintyConfig
 from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares
 from mujoban_rl.actors import Actor, ActorPool, Experience
 from mujoban_rl.engine import Source, State
@@ -28,7 +28,7 @@ _KINDS: Final = ("demonstrations", "corrections")
 
 
 @dataclass(frozen=True)
-class LessonConfig:
+class LessonConfig(UncertaintyConfig):
     """What defines the lessons of a run."""
 
     batch_size: int = 128
@@ -39,9 +39,7 @@ class LessonConfig:
     freshness: float = 0.4
     """New samples, of demonstrations and of corrections each, per sample that is learned from."""
     noise: float = 0.1
-    """Share of a batch whose abstract states are blurred, as estimates are."""
     hidden: float = 0.4
-    """Share of a batch that shows only what the robot may have seen so far."""
     mix: Shares = (0.03, 0.04, 0.06, 0.12, 0.75)
     """Shares of difficulties 1 to 5 among the training levels."""
     long: float = 0.0
@@ -127,6 +125,7 @@ class LessonSource(Source[Batch]):
         self._config, self._pool = config, pool
         self._rng = np.random.default_rng(config.seed)
         self._generator = torch.Generator().manual_seed(config.seed)
+        self._uncertainty = Uncertainty(config)
         self._buffers = {kind: SampleBuffer(config.buffer) for kind in _KINDS}
 
     def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
@@ -149,9 +148,8 @@ class LessonSource(Source[Batch]):
         batch = make_batch(concatenate(parts), self._rng.integers(0, SYMMETRIES, config.batch_size))
         order = torch.randperm(config.batch_size, generator=self._generator)
         batch = Batch._make(x[order] for x in batch)
-        state = blur(batch.state, config.noise, self._generator)
         self.samples += config.batch_size
-        return batch._replace(state=hide_unseen(state, config.hidden, self._rng))
+        return batch._replace(state=self._uncertainty.apply(batch.state, self._generator, self._rng))
 
     def _due(self) -> float:
         """Return how many samples the lessons must have had; what is missing comes in lesson by lesson."""

@@ -33,7 +33,7 @@ from mujoban_planner.search import GraphedEvaluation, evaluate_boards, grow
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import DEAD_SHARE, judge_instructions, label_dead, label_demonstrations, possible_pushes
 from mujoban_planner.training_levels import LevelConfig, Ticket, TrainingLevels, stream_number
-from mujoban_planner.uncertainty import blur, hide_unseen
+from mujoban_planner.uncertainty import Uncertainty, UncertaintyConfig
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
@@ -47,7 +47,7 @@ _NO_BOARDS: Final = BitBoards(_NONE, _NONE, _NONE, np.zeros(0, np.uint8))
 
 
 @dataclass(frozen=True)
-class SearchConfig(LevelConfig):
+class SearchConfig(LevelConfig, UncertaintyConfig):
     """What defines searches, and the batches of what they taught."""
 
     trees: int = 256
@@ -77,17 +77,14 @@ class SearchConfig(LevelConfig):
     buffer: int = 200_000
     """Samples kept of each kind."""
     batch_size: int = 256
-    noise: float = 0.0
-    """Share of a batch whose abstract states are blurred, as estimates are."""
-    hidden: float = 0.0
-    """Share of a batch that shows only what the robot may have seen so far."""
 
     def __post_init__(self) -> None:
         """Reject what is no number of its kind, and no share."""
-        super().__post_init__()
+        LevelConfig.__post_init__(self)
+        UncertaintyConfig.__post_init__(self)
         check_counts(self, "trees", "expansions", "steps", "buffer", "batch_size")
         check_counts(self, "questions", "retries", "lead", "verdicts", least=0)
-        check_shares(self, "retried", "walks", "led", "judged", "easy", "noise", "hidden")
+        check_shares(self, "retried", "walks", "led", "judged", "easy")
 
 
 @dataclass
@@ -291,6 +288,7 @@ class LessonStore:
         """Make room for lessons; `seed` chooses batches."""
         self.config = config
         self.buffers = {"way": SampleBuffer(config.buffer), "verdict": SampleBuffer(config.buffer)}
+        self._uncertainty = Uncertainty(config)
         self._rng = np.random.default_rng([seed, 6])
         self._generator = torch.Generator().manual_seed(seed)
 
@@ -309,8 +307,7 @@ class LessonStore:
         if judged:
             parts.append(verdicts.draw(judged, self._rng))
         batch = make_batch(concatenate(parts), self._rng.integers(0, SYMMETRIES, size))
-        state = blur(batch.state, self.config.noise, self._generator)
-        return batch._replace(state=hide_unseen(state, self.config.hidden, self._rng))
+        return batch._replace(state=self._uncertainty.apply(batch.state, self._generator, self._rng))
 
     def state(self) -> State:
         """Return the lessons and the random states."""

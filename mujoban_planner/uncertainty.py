@@ -8,6 +8,8 @@ Shapes: B batch, N = `grid.GRID_SIZE`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,7 +17,8 @@ from torch import Tensor
 
 from mujoban_core.camera import CameraMount
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, TARGET, WALL
-from mujoban_core.visibility import cells_in_view
+from mujoban_core.ranges import check_not_negative, check_shares
+from mujoban_planner.estimator_errors import ErrorRates, Seen, add_errors, distances, look, nothing_seen, positions
 
 _VIEWS = 6
 """Most views that a hidden state is put together from."""
@@ -27,6 +30,9 @@ A planner is of no body, and what few views leave unknown differs far more from 
 """
 _COMPLETE = 0.5
 """Share of the hidden states in which all that can be seen was seen; of the rest there are a few views."""
+_PLACES = 2
+"""Places beside its cell from which a robot that has seen all has looked: in bags of the running stack, cells that were
+seen were as near to it as to these (`measure_errors`)."""
 _UNSEEN = {WALL: (2.8, -1.0), TARGET: (-2.5, -5.0), BOX: (-2.2, -5.8)}
 """Layer -> mean logit of an estimator in cells that were never in view, where it is set and where it is not.
 
@@ -75,26 +81,68 @@ def blur(state: Tensor, share: float, generator: torch.Generator) -> Tensor:
     return torch.cat([soft, state[n:]])
 
 
-def hide_unseen(state: Tensor, share: float, rng: np.random.Generator) -> Tensor:
+@dataclass(frozen=True)
+class UncertaintyConfig:
+    """What defines how uncertain the states of a batch are."""
+
+    noise: float = 0.0
+    """Share of a batch whose abstract states are blurred, as estimates are."""
+    hidden: float = 0.0
+    """Share of a batch that shows only what the robot may have seen so far."""
+    errors: float = 0.0
+    """Times as often as measured that what the robot has seen is wrong in these states: 1 is as measured, 0 never."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no share, and no factor."""
+        check_shares(self, "noise", "hidden")
+        check_not_negative(self, "errors")
+
+
+class Uncertainty:
+    """Makes the states of batches as uncertain as a configuration says."""
+
+    def __init__(self, config: UncertaintyConfig) -> None:
+        """Read how often the estimator errs, if it is to err."""
+        self._config = config
+        self._rates = ErrorRates.read() if config.errors else None
+
+    def apply(self, state: Tensor, generator: torch.Generator, rng: np.random.Generator) -> Tensor:
+        """Return binary abstract states, [B, N, N, 4], as they may be estimated, by these sources of randomness."""
+        config = self._config
+        state = blur(state, config.noise, generator)
+        return hide_unseen(state, config.hidden, rng, self._rates, config.errors)
+
+
+def hide_unseen(
+    state: Tensor, share: float, rng: np.random.Generator, rates: ErrorRates | None = None, factor: float = 1.0
+) -> Tensor:
     """Return states of which the last share shows only what a robot may have seen; the rest is the estimator's guess.
 
     What it may have seen is either all that can be seen, or a few views from its cell and from others on its way,
-    such as a turn on the spot. Even then rock that no view reaches stays a guess.
+    such as a turn on the spot. Even then rock that no view reaches stays a guess. What was seen is right, if soft,
+    unless there are rates of errors.
 
     Args:
         state: Abstract states, [B, N, N, 4]; a copy is changed.
         share: Share of the batch, from its end.
-        rng: Source of the views and guesses.
+        rng: Source of the views, guesses and errors.
+        rates: How often what was seen is wrong; never by default.
+        factor: Times as often as these say.
     """
     n = int(len(state) * share)
     if n == 0:
         return state
     part = state[len(state) - n :].cpu().numpy()
     complete = np.arange(n) < n * _COMPLETE
-    seen = np.concatenate([visible(part[complete] > 0.5), _seen(part[~complete] > 0.5, rng)])
+    truth = part > 0.5
+    some = _seen(truth[~complete], rng)
+    seen = np.concatenate([visible(truth[complete]), some.cells])
     estimate = np.abs(part - 0.5 * rng.random(part.shape) ** _DOUBT)
-    guess = guesses(part > 0.5, complete, rng)
+    guess = guesses(truth, complete, rng)
     estimate = np.where(seen[..., None], estimate, guess)
+    if rates is not None:
+        nearest = np.concatenate([_from_places(truth[complete], rng), some.nearest])
+        add_errors(estimate, truth, Seen(seen, nearest), rates, factor, rng)
     estimate[..., AGENT] = part[..., AGENT]
     return torch.cat([state[: len(state) - n], torch.from_numpy(estimate.astype(np.float32)).to(state.device)])
 
@@ -123,21 +171,31 @@ def visible(state: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return windows.any((3, 4)) | BORDER
 
 
-def _seen(state: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Return which cells a robot has had in view after some views, [B, N, N]; the border is always known."""
+def _seen(state: NDArray[np.bool_], rng: np.random.Generator) -> Seen:
+    """Return what a robot has had in view after some views; the border is always known."""
     n = len(state)
-    floor = ~state[..., WALL].reshape(n, -1) & ~state[..., BOX].reshape(n, -1)
     here = state[..., AGENT].reshape(n, -1).argmax(1)
-    # A random floor cell per view: the greatest of random numbers.
-    elsewhere = (rng.random((n, _VIEWS, floor.shape[1])) * floor[:, None]).argmax(2)
+    elsewhere = _anywhere(state, _VIEWS, rng)
     stays = rng.random((n, _VIEWS)) < rng.random((n, 1))
     stays[:, 0] = True
     cell = np.where(stays, here[:, None], elsewhere)
     heading = 0.5 * np.pi * rng.integers(0, 4, cell.shape) + rng.normal(0.0, 0.2, cell.shape)
-    half = (GRID_SIZE - 1) / 2
-    x, y = cell % GRID_SIZE - half, half - cell // GRID_SIZE
-    pose = np.stack([x, y, heading], -1).reshape(-1, 3)
-    wall = np.repeat(state[..., WALL], _VIEWS, axis=0)
-    view = cells_in_view(wall, pose, _CAMERA).reshape(n, _VIEWS, GRID_SIZE, GRID_SIZE)
-    count = rng.integers(1, _VIEWS + 1, (n, 1))
-    return np.any(view & (np.arange(_VIEWS) < count)[..., None, None], axis=1) | BORDER
+    count, seen = rng.integers(1, _VIEWS + 1, n), nothing_seen(n)
+    for view in range(_VIEWS):
+        pose = np.concatenate([positions(cell[:, view]), heading[:, view, None]], 1)
+        seen = look(seen, state[..., WALL], pose, _CAMERA, used=view < count)
+    return seen._replace(cells=seen.cells | BORDER)
+
+
+def _from_places(state: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return how near a robot came to each cell that looked around in its cell and a few others, [B, N, N]."""
+    here = state[..., AGENT].reshape(len(state), -1).argmax(1)
+    cells = np.concatenate([here[:, None], _anywhere(state, _PLACES, rng)], 1)
+    return np.min([distances(positions(cell)) for cell in cells.T], axis=0)
+
+
+def _anywhere(state: NDArray[np.bool_], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return random floor cells without a box, [B, count], each the greatest of random numbers."""
+    n = len(state)
+    floor = ~state[..., WALL].reshape(n, -1) & ~state[..., BOX].reshape(n, -1)
+    return (rng.random((n, count, floor.shape[1])) * floor[:, None]).argmax(2)

@@ -29,7 +29,7 @@ from mujoban_sokoban.solver import Status, solve_batch
 
 NETWORK = NetworkConfig(channels=8, blocks=1)
 KINDS = ("way", "verdict")
-SMALL = SearchConfig(trees=16, expansions=20, buffer=4000, steps=16, batch_size=32, noise=0.1, hidden=0.2)
+SMALL = SearchConfig(trees=16, expansions=20, buffer=4000, steps=16, batch_size=32, noise=0.1, hidden=0.2, errors=1.0)
 
 
 @pytest.fixture(scope="module")

@@ -46,7 +46,7 @@ def _quick(monkeypatch):
 
 
 def _imitation(path, actors=None, **changes):
-    small = {"buffer": 50_000, "levels": 16, "stock": 4}
+    small = {"buffer": 50_000, "levels": 16, "stock": 4, "errors": 1.0}
     return imitation(ImitationConfig(**SMALL | small | changes), path, Cadence(publish_updates=1), actors=actors)
 
 
