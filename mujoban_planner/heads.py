@@ -121,6 +121,16 @@ class PlannerHeads(nn.Module):
         return functional.pad(self.walk[0] * towards + self.walk[1] * start, (1, 0))
 
 
+@torch.no_grad()
+def silence_verdicts(heads: PlannerHeads) -> None:
+    """Let a network that will never be taught what is deadly call nothing so; a decision weighs these verdicts."""
+    verdicts = [heads.dead] if heads.push_dead is None else [heads.dead, heads.push_dead[-1]]
+    for head in verdicts:
+        assert isinstance(head, nn.Linear | nn.Conv2d) and head.bias is not None
+        nn.init.zeros_(head.weight)
+        nn.init.constant_(head.bias, -20.0)
+
+
 class PoolAndInject(nn.Module):
     """Mean and maximum over the board, mapped to a bias per channel (Guez et al. 2019)."""
 

@@ -16,11 +16,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_planner.boards import BitBoards, state_tensor
-from mujoban_planner.heads import PlannerOutput
+from mujoban_planner.heads import PlannerOutput, silence_verdicts
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.propagation import legal_pushes, propagate
 from mujoban_planner.push_env import possible_masks
-from mujoban_planner.reinforcement import silence_verdicts
 from mujoban_planner.symmetry import push_images
 from mujoban_sokoban.bitboard import SIDE
 
@@ -70,7 +69,7 @@ class PushPolicy(nn.Module):
             for layer in (self.pushes, last):
                 layer.weight.zero_()
             if untaught:
-                silence_verdicts(planner)
+                silence_verdicts(planner.heads)
                 planner.heads.policy.weight.zero_()
                 assert planner.heads.policy.bias is not None
                 planner.heads.policy.bias.zero_()

@@ -15,14 +15,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from torch import nn
 
 from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
-from mujoban_core.ranges import check_positive
+from mujoban_core.ranges import check_not_negative, check_positive
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_transitions import BagTransitions
-from mujoban_planner.discrete_mpo import DiscreteMPOLearner, MPOBatch, StepStore
+from mujoban_planner.discrete_mpo import MPOBatch, StepStore
+from mujoban_planner.heads import silence_verdicts
+from mujoban_planner.move_learner import MoveLearner
 from mujoban_planner.moves import MoveActor, PlayConfig
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.validation import NetworkConfig, success_rates
@@ -38,6 +39,10 @@ _PLAYED: Final = "abstract environment on generated levels, training seeds"
 class MPOConfig(PlayConfig, NetworkConfig):
     """What defines an MPO run."""
 
+    teach_pushes: bool = False
+    """Teach the push head, by which the policy goes, as well; otherwise the policy only follows it."""
+    anchor: float = 0.0
+    """How much it counts that the verdicts of weights to start from go on saying what they said; 0 lets them drift."""
     bag_share: float = 0.25
     """Share of a batch that comes from bags, where there are any; 1: all, and nothing is played."""
     cpu_seconds: float = 1e9
@@ -46,6 +51,7 @@ class MPOConfig(PlayConfig, NetworkConfig):
     def __post_init__(self) -> None:
         """Reject what is no share, and a budget of nothing."""
         check_positive(self, "cpu_seconds")
+        check_not_negative(self, "anchor")
         if not 0.0 < self.bag_share <= 1.0:
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
 
@@ -106,11 +112,8 @@ class RecordedMoves(Source[MPOBatch]):
         self._generator.set_state(state.tensors["generator"])
 
 
-class MPOLearner(DiscreteMPOLearner):
+class MPOLearner(MoveLearner):
     """A planner that learns over moves."""
-
-    network: LearnedPlanner
-    target: LearnedPlanner
 
     def __init__(
         self, config: MPOConfig, *, device: torch.device | str = "cpu", init: LearnedPlanner | None = None
@@ -119,10 +122,10 @@ class MPOLearner(DiscreteMPOLearner):
         torch.manual_seed(config.seed)  # the initial weights
         network = init or config.build()
         if init is None:
-            silence_verdicts(network)
+            silence_verdicts(network.heads)
         else:
             reset_stay_logit(network)
-        super().__init__(config, network, device)
+        super().__init__(config, network, device, teach_pushes=config.teach_pushes, anchor=config.anchor)
 
     def evaluate(self) -> dict[str, float]:
         """Return solve rates of the target network on held-out levels."""
@@ -189,17 +192,6 @@ def _played(
         pool, MoveStore(config, recorded), steps_per_update=config.steps_per_update * config.environments,
         first_steps=config.warm_up_steps * config.environments,
     )  # fmt: skip
-
-
-@torch.no_grad()
-def silence_verdicts(network: LearnedPlanner) -> None:
-    """Let a network that will never be taught what is deadly call nothing so; a decision weighs these verdicts."""
-    heads = network.heads
-    verdicts = [heads.dead] if heads.push_dead is None else [heads.dead, heads.push_dead[-1]]
-    for head in verdicts:
-        assert isinstance(head, nn.Linear | nn.Conv2d) and head.bias is not None
-        nn.init.zeros_(head.weight)
-        nn.init.constant_(head.bias, -20.0)
 
 
 @torch.no_grad()

@@ -16,13 +16,13 @@ from torch import Tensor, nn
 import mujoban_planner
 from mujoban_baselines.joint.actor import DECISION, MAP, Networks, make_actor
 from mujoban_baselines.joint.decisions import FIELDS
-from mujoban_baselines.joint.planner import JointPlannerLearner
 from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.task import TaskConfig
 from mujoban_controller.controller import VisuomotorController
 from mujoban_controller.mpo import MPOLearner
 from mujoban_controller.privileged import Critic
 from mujoban_planner.discrete_mpo import MPOBatch
+from mujoban_planner.move_learner import MoveLearner
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.limits import NaNGuard
@@ -89,7 +89,9 @@ class JointLearner(Learner[JointBatch]):
         self.controller = MPOLearner(
             networks.controller.train(), body, settings.controller, generator, critic=critic
         )
-        self.planner = JointPlannerLearner(settings.planner.mpo, networks.planner, settings.planner.anchor)
+        self.planner = MoveLearner(
+            settings.planner.mpo, networks.planner, teach_pushes=True, anchor=settings.planner.anchor
+        )
 
     @property
     def _parts(self) -> dict[str, Learner[Any]]:

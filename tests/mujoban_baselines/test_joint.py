@@ -1,6 +1,5 @@
 """The stack fine-tuned as a whole: what is learned from, what is not, and the promises of every trainer."""
 
-import copy
 import json
 import math
 
@@ -13,7 +12,6 @@ import mujoban_planner
 from mujoban_baselines.joint.actor import Networks, make_actor
 from mujoban_baselines.joint.decisions import DecisionLog
 from mujoban_baselines.joint.learner import JointBatch, joint_parts
-from mujoban_baselines.joint.planner import JointPlannerLearner
 from mujoban_baselines.joint.settings import JointSettings, PlannerSettings, StartingWeights
 from mujoban_baselines.task import TaskConfig
 from mujoban_baselines.train import JointRunConfig, main, make_trainer
@@ -21,14 +19,10 @@ from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_core.bodies import ANT, BALL
 from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
-from mujoban_planner.boards import abstract_states
-from mujoban_planner.discrete_mpo import MPOBatch, MPOSettings
-from mujoban_planner.networks import ResidualPlanner
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.testing import check_refusal, check_resuming
-from mujoban_sokoban.generator import generate_batch
 
 TASK = TaskConfig(levels="easy", robots=2, episode_seconds=1.2)
 CONTROLLER = MPOTrainingConfig(
@@ -125,46 +119,6 @@ def test_policies_are_held_while_their_critics_learn_and_move_after_that():
     learner.update(batch, 0.0, NaNGuard())
     assert not moved("controller") and moved("planner"), "of a turn on the spot the controller learns nothing"
     source.close()
-
-
-def taught(anchor):
-    """Teach a planner what is worth what at random; return it, what it began with, states and losses of Q."""
-    torch.manual_seed(0)
-    start = ResidualPlanner(8, 1, judge=True)
-    planner = copy.deepcopy(start)
-    learner = JointPlannerLearner(MPOSettings(learning_rate=1e-2), planner, anchor)
-    states = torch.from_numpy(abstract_states(generate_batch(4, range(64))))
-    instruction, reward = torch.arange(64) % 5, torch.linspace(-2.0, 2.0, 64)
-    batch = MPOBatch(states, instruction, reward, torch.zeros(64), states, torch.ones(64, dtype=torch.bool))
-    losses = [learner.update(batch, 0.0, NaNGuard())["q_loss"] for _ in range(40)]
-    return planner.eval(), start.eval(), states, losses
-
-
-def test_verdicts_stay_what_they_were_while_the_trunk_learns_what_earns():
-    drift = {}
-    for anchor in (0.0, 1.0):
-        planner, start, states, losses = taught(anchor)
-        with torch.no_grad():
-            now, before = planner(states), start(states)
-        possible = now.push > -5.0  # of others nobody asks
-        moves, pushes = (getattr(now, k).sigmoid() - getattr(before, k).sigmoid() for k in ("dead", "push_dead"))
-        drift[anchor] = np.array([float(moves.abs().mean()), float(pushes[possible].abs().mean())])
-        assert losses[-1] < 0.5 * losses[0]
-    assert (drift[1.0] < 0.7 * drift[0.0]).all(), drift
-
-
-def test_what_teaches_the_policy_teaches_the_pushes_and_not_what_is_deadly():
-    planner = mujoban_planner.load(compiled=False)
-    states = torch.from_numpy(abstract_states(generate_batch(4, range(64))))
-    learner = JointPlannerLearner(MPOSettings(), planner, 0.0)
-    answers = learner.answers(planner, states), planner(states)
-    torch.testing.assert_close(answers[0].policy, answers[1].policy)
-    heads = planner.heads
-    for answer, reached in zip(answers, (True, False), strict=True):
-        planner.zero_grad()
-        answer.policy.log_softmax(1)[:, 1].sum().backward()
-        assert (heads.push.weight.grad is not None and bool(heads.push.weight.grad.any())) == reached
-        assert heads.push_dead[-1].weight.grad is None and heads.dead.weight.grad is None
 
 
 def decisions_of(actor, sequences):

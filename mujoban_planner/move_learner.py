@@ -1,4 +1,4 @@
-"""The planner's learner: pushes are taught as well as instructions, verdicts stay what they were.
+"""The learner of MPO over moves: pushes may be taught as well as instructions, verdicts stay what they were.
 
 A planner plays by its push head and its verdicts before all. What is earned teaches the push head through the policy;
 what is deadly is a fact, which the rewards of a few games would only blur, so that an anchor holds the verdicts while
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor, nn
 
 from mujoban_planner.discrete_mpo import Answer, DiscreteMPOLearner, MPOSettings
@@ -19,20 +20,37 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.push_policy import Anchor
 
 
-class JointPlannerLearner(DiscreteMPOLearner):
-    """Learns from what was decided while the stack played."""
+class MoveLearner(DiscreteMPOLearner):
+    """Teaches a planner by what its instructions earned."""
 
     network: LearnedPlanner
     target: LearnedPlanner
 
-    def __init__(self, config: MPOSettings, planner: LearnedPlanner, anchor: float) -> None:
-        """Teach `planner` in place; hold its verdicts to what they are now, by so much, 0 for not at all."""
+    def __init__(
+        self,
+        config: MPOSettings,
+        planner: LearnedPlanner,
+        device: torch.device | str = "cpu",
+        *,
+        teach_pushes: bool,
+        anchor: float,
+    ) -> None:
+        """Teach `planner` in place.
+
+        Args:
+            config: What defines replay and learning.
+            planner: What learns.
+            device: Where.
+            teach_pushes: Whether the push head learns too; otherwise the policy only follows it.
+            anchor: How much it counts that its verdicts go on saying what they say now; 0 for not at all.
+        """
+        super().__init__(config, planner, device)
+        self._teach_pushes = teach_pushes
         self._anchor = Anchor(planner, anchor, 1.0) if anchor else None
-        super().__init__(config, planner)
 
     def answers(self, network: nn.Module, states: Tensor) -> PlannerOutput:
         """Return what a planner says of states, [B, N, N, 4] with values in [0, 1]."""
-        return network(states, follow=False)
+        return network(states, follow=not self._teach_pushes)
 
     def further_losses(self, answer: Answer, states: Tensor) -> Mapping[str, Tensor]:
         """Return how far the verdicts have drifted."""
