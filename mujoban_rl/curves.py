@@ -122,7 +122,8 @@ def read_chart(
         raise ValueError(f"--names: {', '.join(names)}, expected another name for each run")
     curves = {name: read_curve(run, metric) for name, run in zip(names, options.runs, strict=True)}
     if options.runs and not any(curves.values()):
-        raise ValueError(f"{metric}: in none of the runs, expected one of {', '.join(_metrics(options.runs))}")
+        there = ", ".join(_metrics(options.runs))
+        raise ValueError(f"{metric}: in none of the runs, expected a metric of theirs, such as {there}")
     said = what or metric.removeprefix(_JUDGED).replace("_", " ").replace("/", ", ")
     return Chart(curves, said, any(word in metric for word in _RATES), beside or {})
 

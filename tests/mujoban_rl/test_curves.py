@@ -49,8 +49,8 @@ def test_another_metric_is_drawn_in_its_own_unit(run, capsys):
 def test_a_metric_that_no_run_has_is_refused_with_those_that_there_are(run, capsys):
     _, error = shown(capsys, run, "--metric", "evaluation/sucess_rate")
     assert error.splitlines() == [
-        "curves: error: evaluation/sucess_rate: in none of the runs, expected one of evaluation/steps, "
-        "evaluation/success_rate"
+        "curves: error: evaluation/sucess_rate: in none of the runs, expected a metric of theirs, such as "
+        "evaluation/steps, evaluation/success_rate"
     ]
 
 
