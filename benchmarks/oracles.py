@@ -2,13 +2,13 @@
 
 A body that no script drives has its privileged teacher among them. ``python -m benchmarks.oracles --levels 512`` prints
 JSON: solved levels with a 95 % Wilson interval, return, steps and instructions per episode, instructions that ran into
-their limit, and the steps that an instruction takes, by kind.
+their limit, the steps that an instruction takes, by kind, and, of levels kept for tests, that they were used.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,10 +21,13 @@ from bringup.progress import EpisodesBar
 from bringup.rollout import ticks
 from mujoban_core.plugins import ROLES
 from mujoban_core.stats import wilson_interval
+from mujoban_rl.sealed_levels import noted_use
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import VALIDATION_SEEDS
+
+PROG = "benchmarks.oracles"
 
 
 @dataclass(frozen=True)
@@ -40,13 +43,19 @@ class Options:
 
 
 def run(options: Options | None = None) -> dict[str, Any]:
-    """Play every level once; see the module for what is returned."""
+    """Play every level once; see the module for what is returned.
+
+    Raises:
+        ValueError: If the seeds do not all lie in one range.
+    """
     options = options or Options()
+    body = options.physics.body
+    stack = Stack({role: oracle(role, body) for role in ROLES}, body=body)
+    noted = noted_use(options.seed, options.levels, stack.identities(), {"program": PROG, **asdict(options)})
     episodes = list(Episodes(options.levels, options.seed, difficulty=options.difficulty))
     batch = min(options.batch, len(episodes))
-    body = options.physics.body
     world = World(batch, body=body, world=options.physics.world, threads=options.threads)
-    policy = Stack({role: oracle(role, body) for role in ROLES}, body=body).policy()
+    policy = stack.policy()
     issued, timed_out, solved = 0, 0, []
     returns, lengths, unsolved = [], [], []
     durations: dict[GoalKind, list[int]] = {kind: [] for kind in GoalKind}
@@ -83,8 +92,9 @@ def run(options: Options | None = None) -> dict[str, Any]:
         },
         "unsolved_seeds": unsolved,
         "seconds": time.perf_counter() - start,
+        **noted,
     }
 
 
 if __name__ == "__main__":
-    run_benchmark("benchmarks.oracles", Options, run, __doc__)
+    run_benchmark(PROG, Options, run, __doc__)
