@@ -28,7 +28,10 @@ from mujoban_planner.symmetry import SYMMETRIES, view_states
 from mujoban_planner.teacher import Teacher
 from mujoban_rl.engine import Source, State
 
-_TOPICS: Final = (topics.TRUE_EPISODE, topics.TRUE_ABSTRACT_STATE, topics.ABSTRACT_STATE, topics.INSTRUCTION)
+DECISION_TOPICS: Final = (
+    topics.TRUE_EPISODE, topics.TRUE_ABSTRACT_STATE, topics.ABSTRACT_STATE, topics.INSTRUCTION,
+)  # fmt: skip
+"""What a decision is read from."""
 
 
 class Decision(NamedTuple):
@@ -48,13 +51,21 @@ def decisions(ticks: Iterable[EpisodeTick]) -> Iterator[Decision]:
     Args:
         ticks: With values (episode, true abstract state, estimate, instruction), as `episode_ticks` yields them.
     """
-    sequence = 0
-    for episode, (_, truth, estimate, instruction) in ticks:
-        if episode.step == 0:
-            sequence = 0
-        if instruction.sequence != sequence:
-            sequence = instruction.sequence
+    for (_, (_, truth, estimate, instruction)), issued in with_issues(ticks):
+        if issued:
             yield Decision(truth, estimate, Instruction(instruction.direction))
+
+
+def with_issues(ticks: Iterable[EpisodeTick]) -> Iterator[tuple[EpisodeTick, bool]]:
+    """Yield each tick, and whether an instruction was issued in it.
+
+    Args:
+        ticks: With values of `DECISION_TOPICS`, and perhaps of others after them.
+    """
+    place, sequence = DECISION_TOPICS.index(topics.INSTRUCTION), 0
+    for tick in ticks:
+        before, sequence = 0 if tick.episode.step == 0 else sequence, tick.values[place].sequence
+        yield tick, sequence != before
 
 
 class Lessons(NamedTuple):
@@ -79,8 +90,8 @@ class Lessons(NamedTuple):
             BagError: If a bag is damaged, lacks a topic or holds a level that is not for training, or none holds a
                 decision that the solver can label.
         """
-        opened = [open_training_bag(bag, _TOPICS) for bag in find_bags(bags)]
-        made = (decision for bag in opened for decision in decisions(episode_ticks(bag, _TOPICS)))
+        opened = [open_training_bag(bag, DECISION_TOPICS) for bag in find_bags(bags)]
+        made = (decision for bag in opened for decision in decisions(episode_ticks(bag, DECISION_TOPICS)))
         found = [decision for decision in made if stays or decision.instruction != Instruction.STAY]
         if not found:
             raise BagError(f"{', '.join(map(str, bags))}: no instruction, expected bags of played episodes")

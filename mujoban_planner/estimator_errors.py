@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.camera import CameraMount
-from mujoban_core.grid import BOX, GRID_SIZE, TARGET, WALL
+from mujoban_core.grid import BOX, GRID_SIZE, TARGET, WALL, cell_to_xy
 from mujoban_core.visibility import cells_in_view
 
 MEASURED: Final = Path(__file__).with_suffix(".json")
@@ -84,8 +84,7 @@ def look(
 
 def positions(cell: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return where cells, row * N + column, [B], are in the map frame: (x, y) in cells, [B, 2]."""
-    row, column = np.divmod(cell, GRID_SIZE)
-    return np.stack([column - _HALF, _HALF - row], -1).astype(np.float64)
+    return cell_to_xy(np.stack(np.divmod(cell, GRID_SIZE), -1), 1.0)
 
 
 def distances(position: NDArray[np.float64]) -> NDArray[np.float64]:

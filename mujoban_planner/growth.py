@@ -14,10 +14,24 @@ from torch import Tensor
 from mujoban_planner import load
 from mujoban_planner.networks import RecurrentPlanner
 from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.weights import WeightsError
 
 _POOLED = "inject.linear.weight"
 """Weights whose inputs are two values for each channel."""
+
+
+def beginning(config: NetworkConfig, init: str | Path | None) -> LearnedPlanner:
+    """Return the network that a run begins with: as drawn, or with the weights of a trained planner.
+
+    Raises:
+        WeightsError: See `start_from`.
+    """
+    network = config.build()
+    if init is not None:
+        start_from(network, Path(init))
+    network.lay_out()
+    return network
 
 
 def start_from(network: LearnedPlanner, path: Path) -> None:

@@ -18,7 +18,7 @@ from torch.nn import functional
 from mujoban_core.ranges import check_positive
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
-from mujoban_planner.growth import start_from
+from mujoban_planner.growth import beginning
 from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch
@@ -142,10 +142,7 @@ class ImitationLearner(Learner[Batch]):
         """Make the network."""
         self.config, self.device = config, usable_device(device)
         torch.manual_seed(config.seed)  # the initial weights
-        self.network = config.build().to(self.device)
-        if config.init is not None:
-            start_from(self.network, Path(config.init))
-        self.network.lay_out()
+        self.network = beginning(config, config.init).to(self.device)
         self._average = moving_average(self.network, config.ema, warm_up=True)
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, (0.9, 0.98), weight_decay=config.weight_decay, fused=True

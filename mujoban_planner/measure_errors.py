@@ -25,13 +25,12 @@ from mujoban_core.reports import give_report
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
 from mujoban_msgs_py.bags.training import bags_digest, episode_ticks, find_bags, open_training_bag, require_about
+from mujoban_planner.bag_lessons import DECISION_TOPICS, with_issues
 from mujoban_planner.estimator_errors import KINDS, ErrorCounts, Seen, look, nothing_seen
 
 PROG = "mujoban_planner.measure_errors"
 
-_TOPICS: Final = (
-    topics.TRUE_EPISODE, topics.TRUE_ABSTRACT_STATE, topics.ABSTRACT_STATE, topics.INSTRUCTION, topics.TRUE_POSE,
-)  # fmt: skip
+_TOPICS: Final = (*DECISION_TOPICS, topics.TRUE_POSE)
 
 
 @dataclass(frozen=True)
@@ -65,16 +64,14 @@ def count_errors(bags: Sequence[Path]) -> ErrorCounts:
 
 def _decisions(bag: Bag, body: Body) -> Iterator[tuple[Any, Any, Seen]]:
     """Yield estimate and truth, [N, N, 4], and what was seen in an episode so far, for each instruction to move."""
-    seen, sequence = nothing_seen(1), 0
-    for episode, (_, truth, estimate, instruction, pose) in episode_ticks(bag, _TOPICS):
+    seen = nothing_seen(1)
+    for (episode, (_, truth, estimate, instruction, pose)), issued in with_issues(episode_ticks(bag, _TOPICS)):
         if episode.step == 0:
-            seen, sequence = nothing_seen(1), 0
+            seen = nothing_seen(1)
         at = np.asarray(pose, np.float64)[None]
         seen = look(seen, truth[None, ..., WALL] > 0.5, at, body.camera, cell_size=body.cell_size)
-        if instruction.sequence != sequence:
-            sequence = instruction.sequence
-            if instruction.direction != Instruction.STAY:
-                yield estimate, truth, seen
+        if issued and instruction.direction != Instruction.STAY:
+            yield estimate, truth, seen
 
 
 def main(command_line: Sequence[str] | None = None) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -29,6 +29,9 @@ from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_cosine
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
+
+PPO_PACE: Final = {"publish_updates": 1}
+"""How often a run publishes: each rollout is to be played by the newest policy."""
 
 
 @dataclass(frozen=True)

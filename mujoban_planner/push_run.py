@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from mujoban_core.ranges import check_counts, check_not_negative, check_shares
-from mujoban_planner.growth import start_from
+from mujoban_planner.growth import beginning
 from mujoban_planner.push_policy import Anchor, PushPolicy
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Budget
@@ -54,11 +53,7 @@ class PushRunConfig(NetworkConfig):
 def starting_policy(config: PushRunConfig) -> PushPolicy:
     """Return the policy that a run starts with."""
     torch.manual_seed(config.seed)  # the initial weights
-    network = config.build()
-    if config.init is not None:
-        start_from(network, Path(config.init))
-    network.lay_out()
-    return PushPolicy(network, untaught=config.init is None)
+    return PushPolicy(beginning(config, config.init), untaught=config.init is None)
 
 
 def starting_anchor(config: PushRunConfig, policy: PushPolicy) -> Anchor | None:

@@ -32,6 +32,8 @@ from mujoban_rl.engine import Budget, Cadence, Source, State, Trainer
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import lineage, provenance, save_weights
 
+MPO_PACE: Final = {"log_updates": 50, "publish_updates": 5}
+"""How often a run logs and publishes."""
 _PLAYED: Final = "abstract environment on generated levels, training seeds"
 
 
@@ -54,13 +56,6 @@ class MPOConfig(PlayConfig, NetworkConfig):
         check_not_negative(self, "anchor")
         if not 0.0 < self.bag_share <= 1.0:
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
-
-
-@dataclass(frozen=True)
-class _Run(MPOConfig):
-    """A configuration with what the run began with, as its directory keeps it."""
-
-    init: dict[str, str] | None = None
 
 
 class MoveStore(StepStore):
@@ -163,7 +158,7 @@ def reinforcement(
         ValueError: If the directory belongs to another run, or a bag is not what is expected.
     """
     origin = {"path": init_path.name, "digest": digest(init_path)} if init_path else None
-    run = RunDirectory(directory, _Run(**vars(config), init=origin))
+    run = RunDirectory(directory, config, beside={"init": origin})
     recorded = BagTransitions.read(bags) if bags else None
     learner = MPOLearner(config, device=device, init=init)
     if recorded is not None and config.bag_share == 1.0:

@@ -15,12 +15,11 @@ import torch
 from mujoban_core.files import write_atomically
 from mujoban_core.ranges import check_counts, check_positive
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
-from mujoban_planner.growth import start_from
+from mujoban_planner.growth import beginning
 from mujoban_planner.imitation import ImitationConfig, imitation
-from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
-from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
-from mujoban_planner.reinforcement import MPOConfig, reinforcement
+from mujoban_planner.push_ppo import PPO_PACE, PushPPOConfig, push_ppo
+from mujoban_planner.reinforcement import MPO_PACE, MPOConfig, reinforcement
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence, Trainer
@@ -74,10 +73,10 @@ def _mpo(settings: _Settings, place: _Place) -> Trainer[Any]:
     return reinforcement(
         MPOConfig(**options),
         place.run,
-        replace(place.cadence, log_updates=50, publish_updates=5),  # as of a run of its own
+        replace(place.cadence, **MPO_PACE),
         device=place.device,
         actors=place.actors,
-        init=None if path is None else _started(settings.network, path),
+        init=None if path is None else beginning(settings.network, path),
         init_path=path,
     )
 
@@ -87,21 +86,8 @@ def _mpo_pushes(settings: _Settings, place: _Place) -> Trainer[Any]:
 
 
 def _ppo(settings: _Settings, place: _Place) -> Trainer[Any]:
-    # Each rollout is to be played by the newest policy.
-    cadence = replace(place.cadence, publish_updates=1)
+    cadence = replace(place.cadence, **PPO_PACE)
     return push_ppo(PushPPOConfig(**settings.options), place.run, cadence, place.actors)
-
-
-def _started(config: NetworkConfig, weights: Path) -> LearnedPlanner:
-    """Return a network that starts from weights.
-
-    Raises:
-        WeightsError: If they are missing or damaged, or do not fit into the network.
-    """
-    network = config.build()
-    start_from(network, weights)
-    network.lay_out()
-    return network
 
 
 METHODS: Final[Mapping[str, Callable[[_Settings, _Place], Trainer[Any]]]] = {
@@ -182,7 +168,7 @@ def train_stages(
         WeightsError: If the weights to start from are missing or damaged, or do not fit into the network.
     """
     if config.init is not None:
-        _started(config.network, Path(config.init))  # fails before anything is written, if it does
+        beginning(config.network, config.init)  # fails before anything is written, if it does
     RunDirectory(directory, config)
     time, init = TimeLimit(seconds), config.init
     folders = []

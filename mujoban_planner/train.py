@@ -27,8 +27,8 @@ from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_itera
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore
 from mujoban_planner.imitation import ImitationConfig, imitation
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
-from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
-from mujoban_planner.reinforcement import MPOConfig, reinforcement
+from mujoban_planner.push_ppo import PPO_PACE, PushPPOConfig, push_ppo
+from mujoban_planner.reinforcement import MPO_PACE, MPOConfig, reinforcement
 from mujoban_planner.stages import StagesConfig, train_stages
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
@@ -115,7 +115,7 @@ class MPO(_ActorCommand):
         """Train."""
         init = load(self.init, self.device, compiled=False) if self.init is not None else None
         trainer = reinforcement(
-            self.config, self.run, self.cadence(log_updates=50, publish_updates=5), device=self.device,
+            self.config, self.run, self.cadence(**MPO_PACE), device=self.device,
             actors=self.actors, init=init, init_path=self.init, bags=self.bags,
         )  # fmt: skip
         trainer.run(limit_seconds=self.seconds, limit_updates=self.updates)
@@ -147,7 +147,7 @@ class PPO(_ActorCommand):
 
     def main(self) -> None:
         """Train."""
-        push_ppo(self.config, self.run, self.cadence(publish_updates=1), self.actors).run(limit_seconds=self.seconds)
+        push_ppo(self.config, self.run, self.cadence(**PPO_PACE), self.actors).run(limit_seconds=self.seconds)
 
 
 @dataclass(frozen=True)
