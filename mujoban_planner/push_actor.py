@@ -77,7 +77,7 @@ class PushActor(Actor):
         self._environment = PushEnvironment(config.environments)
         self._tickets: list[Ticket] = [Ticket(0, 0, 0)] * config.environments
         self._ways: list[list[int]] = [[] for _ in range(config.environments)]
-        """Pushes in each level so far, as tickets have them."""
+        """Pushes in each level so far, as tickets have them; only where long levels come again."""
         self._reset(np.arange(config.environments))
 
     def set_weights(self, weights: Mapping[str, Tensor], version: int) -> None:
@@ -97,8 +97,9 @@ class PushActor(Actor):
             push = torch.multinomial(log_policy.exp(), 1, generator=self._generator)
             before = {name: column.copy() for name, column in environment.boards._asdict().items()}
             step = environment.step(push[:, 0].numpy())
-            for way, pushed in zip(self._ways, push[:, 0].tolist(), strict=True):
-                way.append(4 * (pushed % SQUARES) + pushed // SQUARES)
+            if config.long:
+                for way, pushed in zip(self._ways, push[:, 0].tolist(), strict=True):
+                    way.append(4 * (pushed % SQUARES) + pushed // SQUARES)
             chosen = log_policy.gather(1, push)[:, 0].numpy()
             reward = step.reward * np.float32(config.reward_scale)
             values = (push[:, 0].numpy(), reward, step.terminated, step.truncated, chosen)
