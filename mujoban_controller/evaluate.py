@@ -1,4 +1,4 @@
-"""Judge the controller: `python -m mujoban_controller.evaluate --episodes 512 --seed 1000`.
+"""Judge the controller: `python -m mujoban_controller.evaluate --episodes 512 --seed 5000000`.
 
 Whole episodes of a solver's plans with exact termination signals, or random instructions of every kind with
 `--instructions random`, or how far it turns while it is told to stay with `--instructions stay`; prints JSON.

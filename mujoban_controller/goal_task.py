@@ -36,7 +36,7 @@ from mujoban_sokoban.levels import Level, LevelError
 EpisodeSource = Callable[[], EpisodeSpec]
 """Yields the next episode to play."""
 _NO_PLAN = 200
-"""Ticks in a row without a plan after which a planned episode is given up: the level cannot be solved any more."""
+"""Decisions in a row without a plan after which a planned episode is given up: the level cannot be solved any more."""
 _ENDLESS = 2.0**62
 """Steps that no episode has; checkpoints hold finite numbers alone."""
 _CHANGING = (

@@ -283,14 +283,14 @@ def make_trainer(options: Options) -> Trainer[Any]:
         ValueError: If weights, a bag or the run directory are not what is expected.
     """
     config = options.config
-    directory = RunDirectory(options.run, config)
+    origins = {name: origin(getattr(config, name)) for name in ("teacher", "initial", "critic")}
+    beside = {"bag_share": options.bag_share if options.bags else None, "origins": origins}
+    directory = RunDirectory(options.run, config, beside=beside)
     learner, source = _Parts(options).make()
     record = {
         **provenance(),
-        "training": directory.config,
-        "teacher": origin(config.teacher),
-        "initial": origin(config.initial),
-        "critic": origin(config.critic),
+        "training": {name: value for name, value in directory.config.items() if name not in beside},
+        **origins,
         "data": _data(options),
         "world": config.task.world,
         "bags": [bag.name for bag in options.bags],

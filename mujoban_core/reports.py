@@ -48,7 +48,7 @@ def noted_uses(path: Path) -> list[dict[str, Any]]:
     """Return the uses of the test range that a report lists; none where there is no report, or a damaged one."""
     try:
         report = json.loads(path.read_text())
-    except (FileNotFoundError, json.JSONDecodeError):
+    except (FileNotFoundError, ValueError):
         return []
     return list(report.get("test_uses", [])) if isinstance(report, dict) else []
 

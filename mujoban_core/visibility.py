@@ -1,4 +1,4 @@
-"""Which cells of the map a robot's camera has in view: for training and for reporting, never a module's input."""
+"""Which cells of a map a camera has in view: of the true one for training and reports, of an estimate for decisions."""
 
 from __future__ import annotations
 

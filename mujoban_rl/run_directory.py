@@ -60,7 +60,8 @@ class RunDirectory:
             path: Directory; an existing one is resumed.
             config: Dataclass or mapping; what must not change between the bits of a run. Options that have come since
                 it began have to be at their defaults.
-            beside: JSON values that must not change either and are no options: a method, what the run began with.
+            beside: JSON values that must not change either and are no options: a method, what the run began with. One
+                that was not noted yet when the run began is taken at its word.
             keep: Number of checkpoints kept.
 
         Raises:
@@ -73,7 +74,7 @@ class RunDirectory:
         file = self.path / _CONFIG
         if file.exists() and any(other != file for other in self.path.iterdir()):
             # An option that there was not yet when the run began is as if it had been left alone.
-            stored = _overlaid(_defaults(config), _read_config(file))
+            stored = _overlaid(_defaults(config), _as_json(beside or {}) | _read_config(file))
             changed = sorted(k for k in stored.keys() | self.config.keys() if stored.get(k) != self.config.get(k))
             if changed:
                 pairs = ", ".join(f"{k}: {stored.get(k)!r} there, {self.config.get(k)!r} now" for k in changed)
@@ -250,7 +251,9 @@ def _newest_first(directory: Path) -> list[Path]:
 
 def _as_json(config: Any) -> dict[str, Any]:
     """Return a configuration, a dataclass or a mapping, as the file has it."""
-    return json.loads(json.dumps(config if dataclasses.is_dataclass(config) else dict(config), default=_plain))
+    content = config if dataclasses.is_dataclass(config) else dict(config)
+    # JSON has no numbers that are not finite.
+    return json.loads(json.dumps(content, default=_plain), parse_constant=str)
 
 
 def _plain(value: Any) -> Any:
@@ -283,7 +286,7 @@ def _overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 def _read_config(file: Path) -> dict[str, Any]:
     """Return the configuration that a run was begun with."""
     try:
-        stored = json.loads(file.read_text())
+        stored = json.loads(file.read_text(), parse_constant=str)
     except ValueError:
         stored = None
     if not isinstance(stored, dict):

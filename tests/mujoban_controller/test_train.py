@@ -183,6 +183,25 @@ def test_a_run_directory_belongs_to_one_configuration(tmp_path):
         make_trainer(Options(tmp_path, replace(STAGES["ppo"], steps=64)))
 
 
+@pytest.mark.parametrize("option", ["initial", "critic"])
+def test_a_run_does_not_go_on_from_other_weights_of_the_same_name(option, tmp_path):
+    weights, file = PrivilegedPolicy("ball") if option == "initial" else Critic("ball"), tmp_path / "w.safetensors"
+    save_weights(file, weights, weights.config, {})
+    options = Options(tmp_path / "run", replace(STAGES["mpo"], **{option: file}), evaluation_episodes=0)
+    make_trainer(options).save()
+    with torch.no_grad():
+        next(weights.parameters()).add_(1.0)
+    save_weights(file, weights, weights.config, {})
+    with pytest.raises(RunError, match="origins: "):
+        make_trainer(options)
+
+
+def test_an_episode_without_an_end_can_be_trained_on_and_stands_in_the_record(tmp_path):
+    task = replace(TASK, horizon=math.inf, overshoot=math.inf)
+    make_trainer(Options(tmp_path, replace(STAGES["ppo"], task=task), evaluation_episodes=0)).save()
+    assert read_record(tmp_path / "teacher.safetensors")["training"]["task"]["horizon"] == "Infinity"
+
+
 def test_training_levels_are_never_test_levels():
     episodes = TrainingEpisodes(1, np.random.default_rng(0), max_nodes=10_000)
     assert all(episodes().seed in TRAIN_SEEDS for _ in range(5))

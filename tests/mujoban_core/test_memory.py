@@ -26,5 +26,20 @@ def test_a_control_group_may_leave_less_than_the_machine_has(
     assert available_memory(meminfo, group(tmp_path, most, used)) == expected
 
 
+@pytest.mark.parametrize("version", [1, 2])
+def test_files_that_a_group_has_cached_are_free_to_take(tmp_path: Path, version: int) -> None:
+    meminfo = tmp_path / "meminfo"
+    meminfo.write_text("MemAvailable:    4000 kB\n")
+    if version == 2:
+        (group(tmp_path, "3000000", 2_900_000) / "memory.stat").write_text("file 9\ninactive_file 1500000\n")
+    else:
+        folder = tmp_path / "memory"
+        folder.mkdir()
+        (folder / "memory.limit_in_bytes").write_text("3000000\n")
+        (folder / "memory.usage_in_bytes").write_text("2900000\n")
+        (folder / "memory.stat").write_text("inactive_file 9\ntotal_inactive_file 1500000\n")
+    assert available_memory(meminfo, tmp_path) == 1_600_000
+
+
 def test_this_machine_has_some() -> None:
     assert available_memory() > 2**20

@@ -49,8 +49,9 @@ def test_parts_of_an_evaluation_are_one_use_and_each_further_look_at_a_level_is_
     assert count_uses([use(0, 3, played=None), use(2, 5, played=None)]) == 2
 
 
-def test_what_stands_in_a_damaged_report_is_replaced(tmp_path: Path) -> None:
+@pytest.mark.parametrize("damaged", [b"{", b"\xff\xfe{"])
+def test_what_stands_in_a_damaged_report_is_replaced(tmp_path: Path, damaged: bytes) -> None:
     report = tmp_path / "report.json"
-    report.write_text("{")
+    report.write_bytes(damaged)
     give_report({"n": 1, "test_uses": [{"commit": "a"}]}, report)
     assert json.loads(report.read_text())["test_uses"] == [{"commit": "a"}]

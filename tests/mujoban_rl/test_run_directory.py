@@ -81,6 +81,24 @@ def test_what_stands_beside_the_options_must_not_change_either(tmp_path):
         RunDirectory(tmp_path, _Config(3), beside={"method": "PPO"})
 
 
+def test_what_was_not_noted_yet_when_a_run_began_is_taken_at_its_word(tmp_path):
+    RunDirectory(tmp_path, {"steps": 3})
+    (tmp_path / "metrics.jsonl").touch()
+    assert RunDirectory(tmp_path, _Config(3), beside={"method": "MPO"}).config["method"] == "MPO"
+
+
+def test_a_number_that_is_not_finite_is_text_in_a_configuration_so_that_weights_can_have_it_in_their_record(tmp_path):
+    directory = RunDirectory(tmp_path, _Config(3, horizon=math.inf))
+    (tmp_path / "metrics.jsonl").touch()
+    net = Net()
+    save_weights(tmp_path / "net.safetensors", net, {}, {"training": directory.config})
+    assert json.loads(record_path(tmp_path / "net.safetensors").read_text())["training"]["horizon"] == "Infinity"
+    (tmp_path / "config.json").write_text(json.dumps({"steps": 3, "part": {}, "horizon": math.inf}))
+    RunDirectory(tmp_path, _Config(3, horizon=math.inf))
+    with pytest.raises(RunError, match=r"horizon: 'Infinity' there, 9\.0 now"):
+        RunDirectory(tmp_path, _Config(3))
+
+
 @pytest.mark.parametrize("part", ["safetensors", "json"])
 def test_a_checkpoint_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path, monkeypatch, part):
     net, adam = _make()
