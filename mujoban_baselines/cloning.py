@@ -22,7 +22,7 @@ from mujoban_baselines.networks import Recurrent
 from mujoban_core.ranges import check_counts
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
-from mujoban_msgs_py.bags.training import episodes, find_bags, open_training_bag
+from mujoban_msgs_py.bags.training import bag_digest, episodes, find_bags, open_training_bag
 from mujoban_rl.engine import Learner, Scalars, Source, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_cosine
@@ -75,7 +75,7 @@ class BagSource(Source[Batch]):
         """
         self._sizes, self._window = (agent.proprio_size, agent.action_size), config.window
         bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
-        self._episodes = EndlessEpisodes(bags, self._read, rng, config.rows, lambda bag: bag.path.name)
+        self._episodes = EndlessEpisodes(bags, self._read, rng, config.rows, lambda bag: bag_digest(bag.path))
 
     def _read(self, bag: Bag) -> Iterator[Fields]:
         """Yield the fields of a bag's episodes, [L, ...] each."""

@@ -31,7 +31,7 @@ from mujoban_core.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMI
 from mujoban_core.interfaces import renew_rows
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
-from mujoban_msgs_py.bags.training import episodes, find_bags, open_training_bag, require_about
+from mujoban_msgs_py.bags.training import bag_digest, episodes, find_bags, open_training_bag, require_about
 from mujoban_rl.engine import State
 from mujoban_rl.recordings import EndlessEpisodes
 from mujoban_sim.goals import GoalTracker
@@ -164,7 +164,7 @@ class BagTicks(Iterator[Fields]):
         bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
         for bag in bags:
             require_about(bag, {"body": config.body, "world": config.world}, "--task.{}")
-        self._episodes = EndlessEpisodes(bags, self._read, rng, rows, lambda bag: bag.path.name)
+        self._episodes = EndlessEpisodes(bags, self._read, rng, rows, lambda bag: bag_digest(bag.path))
         self._memory = Recurrent(*policy.initial_memory(rows))
 
     def _read(self, bag: Bag) -> Iterator[Fields]:

@@ -19,7 +19,8 @@ from mujoban_core.bodies import get_body
 from mujoban_core.worker import Worker
 from mujoban_estimator.bag_stream import TOPICS, BagStream, KeptBags, stretches
 from mujoban_estimator.data import Batch, Batcher, Stretch
-from mujoban_msgs_py.bags.training import ReadReport, open_training_bag
+from mujoban_msgs_py.bags import BagError
+from mujoban_msgs_py.bags.training import ReadReport, bag_digest, open_training_bag
 from mujoban_rl.engine import Source, State
 
 _T = TypeVar("_T")
@@ -61,14 +62,14 @@ class _Item(NamedTuple):
     cpu_seconds: float
 
 
-class _Batches(IterableDataset[_Item]):
-    """Endless batches from a place on."""
+class _Batches(IterableDataset[_Item | BagError]):
+    """Endless batches from a place on, or what is wrong with a bag: raised, a loader would add its traceback."""
 
     def __init__(self, reading: Reading, place: _Place | None, kept: KeptBags | None = None) -> None:
         super().__init__()
         self._reading, self._place, self._kept = reading, place, kept
 
-    def __iter__(self) -> Iterator[_Item]:
+    def __iter__(self) -> Iterator[_Item | BagError]:
         r = self._reading
         kept = KeptBags() if self._kept is None else self._kept
         streams = [
@@ -80,9 +81,12 @@ class _Batches(IterableDataset[_Item]):
             batcher.seen = self._place.seen.copy()
             for stream, state in zip(streams, self._place.streams, strict=True):
                 stream.restore(state)
-        for batch in batcher:
-            place = _Place([stream.state() for stream in streams], batcher.seen.copy())
-            yield _Item(batch, place, time.process_time())
+        try:
+            for batch in batcher:
+                place = _Place([stream.state() for stream in streams], batcher.seen.copy())
+                yield _Item(batch, place, time.process_time())
+        except BagError as error:
+            yield error
 
 
 class _Bag(NamedTuple):
@@ -92,8 +96,8 @@ class _Bag(NamedTuple):
     cpu_seconds: float
 
 
-class _Bags(Dataset[_Bag]):
-    """All bags, one after the other."""
+class _Bags(Dataset[_Bag | BagError]):
+    """All bags, one after the other, or what is wrong with one."""
 
     def __init__(self, reading: Reading) -> None:
         super().__init__()
@@ -102,10 +106,13 @@ class _Bags(Dataset[_Bag]):
     def __len__(self) -> int:
         return len(self._reading.bags)
 
-    def __getitem__(self, index: int) -> _Bag:
+    def __getitem__(self, index: int) -> _Bag | BagError:
         r, start = self._reading, time.process_time()
-        bag = open_training_bag(r.bags[index], TOPICS, skip_damaged=r.skip_damaged)
-        gathered = list(stretches(bag, r.length, ReadReport(), allow_test_seeds=r.allow_test_seeds))
+        try:
+            bag = open_training_bag(r.bags[index], TOPICS, skip_damaged=r.skip_damaged)
+            gathered = list(stretches(bag, r.length, ReadReport(), allow_test_seeds=r.allow_test_seeds))
+        except BagError as error:
+            return error
         return _Bag(gathered, time.process_time() - start)
 
 
@@ -124,6 +131,7 @@ class BagSource(Source[Batch]):
         if workers < 0:
             raise ValueError(f"workers is {workers}: expected a number of processes, from 0")
         self._reading, self._workers = reading, workers
+        self._digests = [bag_digest(bag) for bag in reading.bags]
         self._place: _Place | None = None
         self._items: Iterator[_Item] | None = None
         self._kept: KeptBags | None = None
@@ -155,27 +163,28 @@ class BagSource(Source[Batch]):
             return
         self._kept = KeptBags()
         with children.sheltered():
-            for path, bag in zip(self._reading.bags, _loader(_Bags(self._reading), self._workers), strict=True):
+            bags = _items(iter(_loader(_Bags(self._reading), self._workers)))
+            for path, bag in zip(self._reading.bags, bags, strict=True):
                 self._kept.keep(path, bag.stretches)
                 self._cpu_seconds += bag.cpu_seconds
 
     def _open(self) -> Iterator[_Item]:
         batches = _Batches(self._reading, self._place, self._kept)
         if self._kept is not None:
-            return _ahead(iter(batches))
+            return _ahead(_items(iter(batches)))
         with children.sheltered():
-            return iter(_loader(batches, self._workers))
+            return _items(iter(_loader(batches, self._workers)))
 
     def state(self) -> State:
-        """Return the place in the bags, which are named, so that others begin anew."""
+        """Return the place in the bags, with their digests, so that others begin anew."""
         if self._place is None:
             return State()
-        values = {"bags": [bag.name for bag in self._reading.bags], "streams": self._place.streams}
+        values = {"bags": self._digests, "streams": self._place.streams}
         return State(values, {"seen": torch.from_numpy(self._place.seen)})
 
     def restore(self, state: State) -> None:
         """Go on from the place; from the start where the bags are others than before."""
-        if state.values.get("bags") == [bag.name for bag in self._reading.bags]:
+        if state.values.get("bags") == self._digests:
             self._place = _Place(state.values["streams"], state.tensors["seen"].numpy())
 
     def worker_cpu_seconds(self) -> float:
@@ -197,6 +206,15 @@ def _loader(dataset: Dataset[_T], workers: int) -> DataLoader[_T]:
         worker_init_fn=_begin,
         generator=torch.Generator(),  # else the loader draws from the global one
     )
+
+
+def _items(found: Iterator[_T | BagError]) -> Iterator[_T]:
+    """Yield what was found, and raise what is wrong with a bag."""
+    while (item := next(found, None)) is not None:
+        if isinstance(item, BagError):
+            del found  # and with it the processes that read, for which the error would keep it
+            raise item
+        yield item
 
 
 def _ahead(items: Iterator[_Item]) -> Iterator[_Item]:

@@ -80,7 +80,7 @@ class KeptBags:
     def __init__(self, limit: int | None = None) -> None:
         """Keep bags, the first that are read, up to so many bytes in all; the others are read again.
 
-        A tick has 12.5 KB. The limit is by default a third of the memory that is available.
+        A tick has some 14 KB. The limit is by default a third of the memory that is available.
         """
         self._bags: dict[Path, list[Stretch]] = {}
         self._free = int(_KEPT_SHARE * available_memory()) if limit is None else limit

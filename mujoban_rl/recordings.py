@@ -37,7 +37,7 @@ class EndlessEpisodes(Generic[RecordingT]):
             read: Yields the fields of a recording's episodes, [L, ...] each with `first`.
             rng: Draws the order.
             rows: R.
-            name: Tells recordings apart when a run goes on.
+            name: What a recording is known by when a run goes on.
         """
         self._rng = rng
         self._names = [name(recording) for recording in recordings]

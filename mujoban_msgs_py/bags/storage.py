@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import apsw
+import yaml
 import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
@@ -177,7 +178,7 @@ class McapFile(Storage):
         statistics = summary.statistics
         counts = statistics.channel_message_counts
         span = (statistics.message_start_time, statistics.message_end_time) if statistics.message_count else None
-        return _gather(summary.channels, summary.schemas, counts, span)
+        return self._gather(summary.channels, summary.schemas, counts, span)
 
     def _scan(self) -> _Contents:
         channels: dict[int, Channel] = {}
@@ -193,7 +194,38 @@ class McapFile(Storage):
                 counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
                 first, last = span or (record.log_time, record.log_time)
                 span = min(first, record.log_time), max(last, record.log_time)
-        return _gather(channels, types, counts, span)
+        return self._gather(channels, types, counts, span)
+
+    def _gather(
+        self, channels: dict[int, Channel], types: dict[int, Schema], counts: dict[int, int],
+        span: tuple[int, int] | None,
+    ) -> _Contents:  # fmt: skip
+        topics: dict[str, TopicInfo] = {}
+        for channel in channels.values():
+            if channel.schema_id not in types:
+                continue  # of another encoding, such as JSON, which nothing here reads
+            info = topics.get(channel.topic)
+            if info is None:
+                qos = self._qos_of(channel)
+                info = topics[channel.topic] = TopicInfo(channel.topic, types[channel.schema_id].name, 0, qos)
+            info.count += counts.get(channel.id, 0)
+        texts = {s.name: self._text_of(s) for s in types.values() if s.encoding == "ros2msg"}
+        schemas = {name: text for name, text in texts.items() if text is not None}
+        return _Contents(topics, schemas, span, channels, types)
+
+    def _qos_of(self, channel: Channel) -> list[dict[str, Any]]:
+        try:
+            return load_qos(channel.metadata.get("offered_qos_profiles", ""))
+        except (yaml.YAMLError, TypeError, ValueError):
+            self._damage(f"has QoS profiles of {channel.topic} that are no list in YAML")
+            return []
+
+    def _text_of(self, schema: Schema) -> str | None:
+        try:
+            return schema.data.decode()
+        except UnicodeDecodeError:
+            self._damage(f"has a definition of {schema.name} that is no text")
+            return None
 
     def messages(self, topics: frozenset[str] | None) -> Iterator[RawMessage]:
         """Yield the messages of these topics (None: of all) in the order of the file."""
@@ -202,7 +234,9 @@ class McapFile(Storage):
         for record in self._records(note=True):
             if isinstance(record, Message):
                 channel = channels.get(record.channel_id)
-                if channel is None or (topics is not None and channel.topic not in topics):
+                if channel is None or channel.schema_id not in types:
+                    continue
+                if topics is not None and channel.topic not in topics:
                     continue
                 yield RawMessage(channel.topic, types[channel.schema_id].name, record.log_time, record.data)
             elif isinstance(record, Channel):
@@ -330,20 +364,6 @@ def _count_messages(path: Path) -> int:
     if said != ["ok"]:
         raise BagError(f"{path} is damaged: {' '.join(str(said[0]).split())}")
     return int(count)
-
-
-def _gather(
-    channels: dict[int, Channel], types: dict[int, Schema], counts: dict[int, int], span: tuple[int, int] | None
-) -> _Contents:
-    topics: dict[str, TopicInfo] = {}
-    for channel in channels.values():
-        info = topics.get(channel.topic)
-        if info is None:
-            qos = load_qos(channel.metadata.get("offered_qos_profiles", ""))
-            info = topics[channel.topic] = TopicInfo(channel.topic, types[channel.schema_id].name, 0, qos)
-        info.count += counts.get(channel.id, 0)
-    schemas = {s.name: s.data.decode() for s in types.values() if s.encoding == "ros2msg"}
-    return _Contents(topics, schemas, span, channels, types)
 
 
 def _qos_of(extension: Any) -> list[dict[str, Any]]:

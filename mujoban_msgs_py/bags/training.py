@@ -22,7 +22,7 @@ from mujoban_msgs_py.bags.reader import Bag, open_bag
 from mujoban_msgs_py.bags.recovery import REPLACED
 from mujoban_msgs_py.conversions import EpisodeTruthReading
 from mujoban_msgs_py.topics import Topic
-from mujoban_sokoban.generator import TRAIN_SEEDS
+from mujoban_sokoban.generator import TEST_SEEDS, TRAIN_SEEDS
 
 
 def find_bags(folders: Sequence[Path]) -> list[Path]:
@@ -75,10 +75,15 @@ def bags_digest(folders: Sequence[Path]) -> str | None:
     """
     total = hashlib.sha256()
     for bag in find_bags(folders):
-        # It has the checksums of all files; a bag that was cut short has none.
-        metadata = bag / FILE_NAME
-        total.update(f"{bag.name}\0{digest(metadata if metadata.is_file() else bag)}\0".encode())
+        total.update(f"{bag.name}\0{bag_digest(bag)}\0".encode())
     return total.hexdigest() if folders else None
+
+
+def bag_digest(bag: Path) -> str:
+    """Return the SHA-256 by which a bag is known again, wherever it lies: names are the same in every recording."""
+    # Metadata have the checksums of all files; a bag that was cut short has none.
+    metadata = bag / FILE_NAME
+    return digest(metadata if metadata.is_file() else bag)
 
 
 def require_training_seeds(bag: Bag) -> None:
@@ -91,6 +96,21 @@ def require_training_seeds(bag: Bag) -> None:
     """
     for value in bag.read([topics.TRUE_EPISODE.name]):
         _require_training_level(bag, value.value)
+        return
+
+
+def require_untested(bag: Bag) -> None:
+    """Refuse to choose by a bag that begins with an episode whose level is for tests; as `require_training_seeds`.
+
+    Raises:
+        BagError: If it does, or is damaged.
+    """
+    for value in bag.read([topics.TRUE_EPISODE.name]):
+        if value.value.seed in TEST_SEEDS and value.value.difficulty:
+            raise BagError(
+                f"{bag.path} holds an episode with seed {value.value.seed}, one for tests, by which nothing is chosen: "
+                "expected validation or training levels"
+            )
         return
 
 
@@ -131,6 +151,8 @@ class ReadReport:
     episodes: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
     """Ticks that were left out, by reason."""
+    seeds: set[int] = field(default_factory=set)
+    """Seeds of the generated levels."""
 
 
 class EpisodeTick(NamedTuple):
@@ -171,9 +193,14 @@ def episode_ticks(
         reading: EpisodeTruthReading = tick.values[which]
         if not allow_test_seeds:
             _require_training_level(bag, reading)
+        if reading.episode == number and (0 < reading.step < following or (reading.step, following) == (0, 1)):
+            report.skipped["that stand there twice"] += 1  # as after a simulator that was killed offers its tick again
+            continue
         if reading.step == 0:
             number, following = reading.episode, 0
             report.episodes += 1
+            if reading.difficulty:
+                report.seeds.add(reading.seed)
         if number is None:
             report.skipped["of an episode whose start is missing"] += 1
         elif reading.episode != number or reading.step != following:

@@ -13,7 +13,7 @@ from mujoban_core.bodies import BALL
 from mujoban_core.grid import Instruction
 from mujoban_estimator.bag_stream import TOPICS, BagStream, KeptBags, stretches
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.bags import BagError
+from mujoban_msgs_py.bags import BagError, BagWriter
 from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag, require_training_seeds
 
 
@@ -55,6 +55,22 @@ def test_behind_a_missing_tick_an_episode_is_not_used(bags, tmp_path):
     found = list(stretches(open_training_bag(tmp_path / "bag", TOPICS), 64, report))
     assert [len(s.frame) for s in found] == [2, 12]
     assert sum(report.skipped.values()) == 4
+
+
+@pytest.mark.parametrize("twice", [1, 2, 4])
+def test_a_tick_that_stands_twice_in_a_bag_is_used_once_and_what_follows_too(bags, tmp_path, twice):
+    bag = open_training_bag(find_bags([bags])[0], TOPICS)
+    messages = list(bag.messages())
+    with BagWriter(tmp_path / "bag", RECORDED) as writer:
+        for stamp in sorted({message.stamp for message in messages}):
+            for _ in range(2 if stamp == twice * topics.TICK else 1):
+                for message in messages:
+                    if message.stamp == stamp:
+                        writer.write(message.topic, stamp, message.data)
+    report = ReadReport()
+    found = list(stretches(open_training_bag(tmp_path / "bag", TOPICS), 64, report))
+    assert [len(s.frame) for s in found] == [7, 12]
+    assert report.skipped == {"that stand there twice": 1} and report.episodes == 2
 
 
 def test_a_bag_that_begins_amid_an_episode_is_used_from_the_next_start(bags, tmp_path):

@@ -150,6 +150,38 @@ def test_where_damage_is_skipped_foreign_and_double_messages_are_left_out_and_na
     assert opened.skipped
 
 
+def foreign(path, channel):
+    """Write a file of another writer, with a channel of whatever kind beside one that is as it should be."""
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start()
+        text = b"\xff" if channel == "schema" else b"string data"
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", text)
+        sound = writer.register_channel("/sound", "cdr", schema)
+        metadata = {"qos": {"offered_qos_profiles": "{"}, "list": {"offered_qos_profiles": "3"}}.get(channel, {})
+        other = writer.register_channel("/other", "json", 0 if channel == "json" else schema, metadata)
+        for topic in (sound, other):
+            writer.add_message(topic, 5, b"{}", 5)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("channel", "named"), [("qos", "QoS profiles of /other"), ("list", "QoS"), ("schema", "no text")]
+)
+def test_what_another_writer_got_wrong_is_named_and_can_be_skipped(tmp_path, channel, named):
+    path = foreign(tmp_path / "other.mcap", channel)
+    with pytest.raises(BagError, match=rf"other\.mcap .*{named}"):
+        open_bag(path).topics  # noqa: B018
+    bag = open_bag(path, damaged="skip")
+    assert set(bag.topics) == {"/sound", "/other"}
+
+
+def test_a_channel_without_a_schema_is_left_out(tmp_path):
+    bag = open_bag(foreign(tmp_path / "other.mcap", "json"))
+    assert set(bag.topics) == {"/sound"} and [m.topic for m in bag.messages()] == ["/sound"]
+
+
 def test_no_flipped_bit_of_a_bag_is_read_over(bag, tmp_path):
     rng, silent = np.random.default_rng(0), []
     names = ["metadata.yaml", "bag_0.mcap", "bag_2.mcap"]
