@@ -13,14 +13,14 @@ if __name__ == "__main__":
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mujoban_core.files import check_file
+from mujoban_core.files import check_file, digest
 from mujoban_core.interfaces import INSTRUCTION_LIMIT, renew_rows
 from mujoban_core.program import read_options, run_command
 from mujoban_core.reports import give_report
@@ -33,7 +33,9 @@ from mujoban_estimator.estimator import Belief, StateEstimator, probabilities
 from mujoban_estimator.metrics import MapScores, TerminationScores
 from mujoban_estimator.odometry import Track
 from mujoban_estimator.termination import ControlTermination
-from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag, require_about
+from mujoban_msgs_py.bags.training import ReadReport, bags_digest, find_bags, open_training_bag, require_about
+from mujoban_rl.sealed_levels import noted_use
+from mujoban_sokoban.generator import TEST_SEEDS
 
 PROG = "mujoban_estimator.evaluate"
 
@@ -50,8 +52,9 @@ def evaluate(
     *,
     max_ticks: int | None = None,
     skip_damaged: bool = False,
+    report: ReadReport | None = None,
 ) -> dict[str, float]:
-    """Return rates of both modules on the given bags.
+    """Return rates of both modules on the given bags, also on those of levels that are not for training.
 
     Args:
         estimator: on any device.
@@ -59,12 +62,16 @@ def evaluate(
         bags: paths of bags.
         max_ticks: stop after about so many ticks.
         skip_damaged: leave out damaged parts of bags.
+        report: counts what is read.
 
     Raises:
         mujoban_msgs_py.bags.BagError: if a bag cannot be read or is of another body.
+        ValueError: if the two modules are of different bodies.
     """
-    report = ReadReport()
-    body = estimator.body.name
+    report = ReadReport() if report is None else report
+    body, other = estimator.body.name, termination.config.body
+    if other != body:
+        raise ValueError(f"an estimator of the body {body} and a termination of {other}: expected both of one body")
     streams = [_chain(bags[i::_STREAMS], body, report, skip_damaged) for i in range(min(_STREAMS, len(bags)))]
     score = _Scoring(estimator, termination, len(streams))
     for batch in Batcher(streams, _LENGTH, estimator.body):
@@ -186,12 +193,19 @@ def main(command_line: Sequence[str] | None = None) -> int:
     options = read_options(Options, command_line, PROG, __doc__)
     check_file("--json", options.json)
     set_threads(options.threads)
-    result = evaluate(
+    read = ReadReport()
+    rates = evaluate(
         load(options.estimator, options.device, compiled=False),
         load_termination(options.termination, options.device, compiled=False),
-        find_bags(options.bags), max_ticks=options.max_ticks, skip_damaged=options.skip_damaged,
+        find_bags(options.bags), max_ticks=options.max_ticks, skip_damaged=options.skip_damaged, report=read,
     )  # fmt: skip
-    give_report({k: None if v != v else round(v, 5) for k, v in result.items()}, options.json)
+    result: dict[str, Any] = {k: None if v != v else round(v, 5) for k, v in rates.items()}
+    result["weights"] = {"estimator": digest(options.estimator), "termination": digest(options.termination)}
+    if tested := [seed for seed in read.seeds if seed in TEST_SEEDS]:
+        first, last = min(tested), max(tested)
+        how = {"program": PROG, "bags_digest": bags_digest(options.bags), "max_ticks": options.max_ticks}
+        result |= noted_use(first, last - first + 1, result["weights"], how)
+    give_report(result, options.json)
     return 0
 
 

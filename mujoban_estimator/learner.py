@@ -144,14 +144,16 @@ class EstimatorLearner(Learner[Batch]):
     """Trains both modules, with what they remember of each stream; a batch continues the one before."""
 
     def __init__(
-        self, config: TrainConfig, *, device: str = "cpu", validation: Sequence[Path] = (), out: Path | None = None
-    ) -> None:
+        self, config: TrainConfig, *, device: str = "cpu", validation: Sequence[Path] = (), skip_damaged: bool = False,
+        out: Path | None = None,
+    ) -> None:  # fmt: skip
         """Make both modules on one shared ResNet.
 
         Args:
             config: Settings; the seed decides weights and every draw.
             device: Where the modules learn.
             validation: Bags to evaluate on; none: no evaluation.
+            skip_damaged: Leave damaged parts of these out instead of refusing them.
             out: Folder that receives the weights of both modules; None: `weights` in the run's directory.
         """
         self.training, self.config = config, config.learner
@@ -167,9 +169,11 @@ class EstimatorLearner(Learner[Batch]):
         self._threads = ThreadPoolExecutor(
             config.shards, "shard", torch.set_num_threads, (torch.get_num_threads(),)
         )  # fmt: skip
-        self._validation, self._out = list(validation), out
+        self._validation, self._skip_damaged, self._out = list(validation), skip_damaged, out
         self._belief = self.estimator.initial_belief(config.streams)
         self._track = self._lost_track(config.streams)
+        self._begun = np.zeros(config.streams, np.bool_)
+        """Streams in which an episode began in a batch that was refused, so that they have the memory of another."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -206,7 +210,9 @@ class EstimatorLearner(Learner[Batch]):
         loss = torch.stack([one.loss for one in learned]).mean()
         for parameter, *gradients in zip(self._parameters, *(one.gradients for one in learned), strict=True):
             parameter.grad = _mean(parameter, [g for g in gradients if g is not None], len(learned))
-        if step_if_finite(loss, [self.optimiser], guard, clip=self.training.clip) is not None:
+        taken = step_if_finite(loss, [self.optimiser], guard, clip=self.training.clip) is not None
+        self._begun = np.zeros_like(batch.first) if taken else self._begun | batch.first
+        if taken:
             # What a refused batch left in memory would spoil those to come.
             self._belief = Belief(*(torch.cat(rows) for rows in zip(*(one.belief for one in learned), strict=True)))
             self._track = Track(*(torch.cat(rows) for rows in zip(*(one.track for one in learned), strict=True)))
@@ -217,7 +223,7 @@ class EstimatorLearner(Learner[Batch]):
         """Return the random state and what the modules remember of each stream."""
         tensors = {f"belief.{k}": v for k, v in self._belief._asdict().items()}
         tensors |= {f"track.{k}": v for k, v in self._track._asdict().items()}
-        return State({"rng": self.rng.bit_generator.state}, tensors)
+        return State({"rng": self.rng.bit_generator.state, "begun": self._begun.tolist()}, tensors)
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
@@ -225,10 +231,14 @@ class EstimatorLearner(Learner[Batch]):
         tensors = {k: v.to(self.device) for k, v in state.tensors.items()}
         self._belief = Belief(*(tensors[f"belief.{k}"] for k in Belief._fields))
         self._track = Track(*(tensors[f"track.{k}"] for k in Track._fields))
+        # Runs that began before this was noted have none.
+        self._begun = np.array(state.values.get("begun", self._begun), np.bool_)
 
     def evaluate(self) -> dict[str, float]:
         """Return the rates of both modules on the validation bags."""
-        return evaluate(self.estimator, self.termination, self._validation) if self._validation else {}
+        if not self._validation:
+            return {}
+        return evaluate(self.estimator, self.termination, self._validation, skip_damaged=self._skip_damaged)
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the weights of both modules."""
@@ -253,8 +263,9 @@ class EstimatorLearner(Learner[Batch]):
     def _shards(self, batch: Batch) -> Iterator[_Shard]:
         """Divide the streams; all that is drawn by chance is drawn here, so that threads draw nothing."""
         streams, count = len(batch.valid), self.training.shards
-        belief = renew_rows(self._belief, self.estimator.initial_belief(streams), batch.first)
-        track = renew_rows(self._track, self._lost_track(streams), batch.first)
+        fresh = batch.first | self._begun
+        belief = renew_rows(self._belief, self.estimator.initial_belief(streams), fresh)
+        track = renew_rows(self._track, self._lost_track(streams), fresh)
         frames = -(-self.config.window_frames // count)
         # Slices, whose frames are not copied.
         bounds = np.cumsum([0, *map(len, np.array_split(np.arange(streams), count))]).tolist()

@@ -32,6 +32,7 @@ from mujoban_msgs_py.bags.training import (
     open_training_bag,
     require_about,
     require_training_seeds,
+    require_untested,
 )
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory
@@ -83,30 +84,36 @@ def make_trainer(options: Options) -> Trainer[Batch]:
     worlds = set[str]()
     for path in (*bags, *validation):
         bag = open_training_bag(path, TOPICS, skip_damaged=options.skip_damaged)
+        if path in validation:
+            require_untested(bag)
         if path in bags and not options.allow_test_seeds:
             require_training_seeds(bag)
         require_about(bag, {"body": config.learner.estimator.body}, "--learner.estimator.{}")
         worlds.add(bag.about.get("world", "not stated"))
-    learner = EstimatorLearner(config, device=options.device, validation=validation, out=options.out)
+    learner = EstimatorLearner(
+        config, device=options.device, validation=validation, skip_damaged=options.skip_damaged, out=options.out
+    )
     if options.start is not None:
         learner.start_from(options.start)
     reading = Reading(
         bags, config.learner.estimator.body, config.streams, config.length, config.seed,
         skip_damaged=options.skip_damaged, allow_test_seeds=options.allow_test_seeds,
     )  # fmt: skip
+    start = None if options.start is None else _digests(options.start)
+    directory = RunDirectory(options.run, config, beside={"start": start})
     every = options.evaluate_every * config.streams * config.length
     record = {
         **provenance(),
         "data": [p.name for p in options.bags],
         "bags": len(bags),
         "bags_digest": bags_digest(bags),
-        "start": None if options.start is None else _digests(options.start),
+        "start": start,
         "world": ", ".join(sorted(worlds)),
         "training": asdict(config),
     }
     source = BagSource(reading, options.workers)
     trainer = Trainer(
-        RunDirectory(options.run, config),
+        directory,
         learner,
         source,
         Budget(updates=config.steps, cpu_seconds=config.cpu_seconds, seconds=config.horizon_seconds),

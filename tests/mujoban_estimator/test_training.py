@@ -1,25 +1,34 @@
 """The training of estimator and termination from bags: options, resuming, processes that read."""
 
+import json
 import multiprocessing
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimator_bags import SEED, copy_without
+from estimator_bags import SEED, copy_without, made_up_ticks
 
 from bringup.command import Choice, Stack
 from bringup.exploration import Disturbance
 from bringup.record import Job, MixedEpisodes, record
+from bringup.rollout_recorder import Recorder
+from mujoban_core.bodies import BALL
 from mujoban_core.plugins import ROLES
 from mujoban_core.program import exit_status
-from mujoban_estimator import load, load_termination
+from mujoban_estimator import bag_source, bag_stream, load, load_termination
+from mujoban_estimator.bag_source import BagSource, Reading
 from mujoban_estimator.bag_stream import TOPICS
 from mujoban_estimator.estimator import EstimatorConfig
 from mujoban_estimator.evaluate import evaluate
+from mujoban_estimator.evaluate import main as judge
 from mujoban_estimator.learner import EstimatorLearner, LearnerConfig, TrainConfig
 from mujoban_estimator.termination import TerminationConfig
 from mujoban_estimator.train import Options, main, make_trainer
+from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError
 from mujoban_msgs_py.bags.training import find_bags, open_training_bag
+from mujoban_rl.run_directory import RunError
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import WeightsError
 
@@ -107,12 +116,90 @@ def test_a_batch_with_nan_leaves_both_modules_their_memory_and_the_optimiser_unt
     check_refusal(make(tmp_path), poisoned)
 
 
-def test_other_bags_may_be_learned_from_in_the_next_bit_of_a_run(bags, make, tmp_path):
+def test_the_next_bit_of_a_run_begins_other_bags_anew_also_of_the_same_names(bags, make, tmp_path):
+    (first,) = find_bags([bags])
     make(tmp_path / "run").run(limit_updates=1)
-    copy_without(open_training_bag(find_bags([bags])[0], TOPICS), tmp_path / "other", lambda *_: False)
+    moved = tmp_path / "moved" / first.name
+    shutil.copytree(first, moved)
+    other = tmp_path / "other" / first.name
+    copy_without(open_training_bag(first, TOPICS), other, lambda _, stamp: stamp == 6 * topics.TICK)
+    begins = {}
+    for name in ("moved", "other"):
+        source = make(tmp_path / "run", bags=tmp_path / name).source
+        begins[name] = source.next_batch().first.all()
+        source.close()
+    assert begins == {"moved": False, "other": True}
     resumed = make(tmp_path / "run", bags=tmp_path / "other")
     resumed.run(limit_updates=2)
     assert resumed.progress.updates == 2
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2])
+def test_what_is_wrong_with_a_bag_is_told_alike_whoever_reads_it(bags, make, tmp_path, workers, monkeypatch):
+    def refused(*_, **__):
+        raise BagError("part0: damaged, expected a whole bag")
+        yield
+
+    monkeypatch.setattr(bag_source, "stretches", refused)
+    monkeypatch.setattr(bag_stream, "stretches", refused)
+    source = BagSource(Reading(find_bags([bags]), "ball", 1, 4, 0), workers)
+    with pytest.raises(BagError, match=r"^part0: damaged, expected a whole bag$"):
+        source.next_batch()
+    source.close()
+
+
+def test_damaged_parts_of_validation_bags_are_left_out_too_where_that_is_asked_for(bags, tmp_path):
+    damaged = tmp_path / "bags" / "damaged"
+    shutil.copytree(find_bags([bags])[0], damaged)
+    (file,) = damaged.glob("*.mcap")
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    file.write_bytes(content)
+    small = EstimatorConfig(channels=8, blocks=1), TerminationConfig(channels=8, blocks=1)
+    config = TrainConfig(LearnerConfig(*small, window_frames=8), streams=1, length=4, steps=1)
+    options = Options((bags,), tmp_path / "run", (damaged,), config=config, workers=0)
+    with pytest.raises(BagError, match="damaged"):
+        make_trainer(options)
+    make_trainer(replace(options, run=tmp_path / "skipping", skip_damaged=True)).run()
+
+
+def test_nothing_is_chosen_by_test_levels_and_judging_on_them_is_noted(make, bags, tmp_path):
+    episodes = MixedEpisodes(1, 1000, [1])
+    with Recorder(tmp_path / "tests", BALL, episodes, [1]) as recorder:
+        for tick in made_up_ticks(episodes, (5,)):
+            recorder.write(tick)
+    with pytest.raises(BagError, match="seed 1000, one for tests, by which nothing is chosen"):
+        make_trainer(Options((bags,), tmp_path / "run", (tmp_path / "tests",)))
+    make(tmp_path / "made").save()
+    weights = tmp_path / "made" / "weights"
+    command = [x for name in ("estimator", "termination") for x in (f"--{name}", str(weights / f"{name}.safetensors"))]
+    report = tmp_path / "report.json"
+    assert judge([*command, "--bags", str(tmp_path / "tests"), "--json", str(report)]) == 0
+    content = json.loads(report.read_text())
+    (use,) = content["test_uses"]
+    assert use["seeds"] == [1000, 1000] and use["weights"] == content["weights"]
+    assert judge([*command, "--bags", str(bags), "--json", str(report)]) == 0
+    assert "test_uses" not in json.loads(report.read_text())
+
+
+def test_a_run_that_began_with_weights_goes_on_with_the_same_named_ones_alone(make, bags, tmp_path):
+    make(tmp_path / "made").save()
+    small = EstimatorConfig(channels=8, blocks=1), TerminationConfig(channels=8, blocks=1)
+    config = TrainConfig(LearnerConfig(*small, window_frames=8), streams=1, length=4, steps=20)
+    options = Options((bags,), tmp_path / "run", start=tmp_path / "made" / "weights", config=config, workers=0)
+    make_trainer(options).save()
+    make_trainer(options)
+    with pytest.raises(RunError, match=r"start: \{'estimator': '.*'\} there, None now"):
+        make_trainer(replace(options, start=None))
+
+
+def test_modules_of_different_bodies_are_not_judged_together(bags):
+    ball, ant = (
+        EstimatorLearner(TrainConfig(LearnerConfig(EstimatorConfig(body=body), TerminationConfig(body=body))))
+        for body in ("ball", "ant")
+    )
+    with pytest.raises(ValueError, match="an estimator of the body ball and a termination of ant: expected both"):
+        evaluate(ball.estimator, ant.termination, find_bags([bags]))
 
 
 def test_what_is_read_does_not_depend_on_how_many_processes_read(make, tmp_path):
