@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from mujoban_core.files import check_file
 from mujoban_core.program import read_options, run_command
+from mujoban_core.ranges import check_counts
 from mujoban_core.reports import give_report
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.bag_lessons import Lessons
@@ -62,6 +63,10 @@ class Options:
     """Image to write."""
     json: Path | None = None
     """Where the figures are written."""
+
+    def __post_init__(self) -> None:
+        """Reject no levels."""
+        check_counts(self, "episodes")
 
 
 class Verdicts(NamedTuple):

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_planner.teacher import DISCOUNT
 from mujoban_rl.actors import ReplayStore
 from mujoban_rl.engine import Learner, State
@@ -59,6 +60,14 @@ class MPOSettings:
     critic_first: int = 0
     """Updates in which the critic learns alone and the policy is held; a policy that is good already needs it."""
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Reject numbers with which nothing is played or learned, and what is no share."""
+        check_counts(self, "environments", "play", "n_step", "replay_steps", "batch_size", "target_period")
+        check_counts(self, "critic_first", "seed", least=0)
+        check_positive(self, "steps_per_update", "learning_rate", "dual_learning_rate")
+        check_not_negative(self, "warm_up_steps", "q_weight")
+        check_shares(self, "discount")
 
 
 class MPOBatch(NamedTuple):
@@ -172,10 +181,10 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
         q_loss = (errors * batch.valid).sum() / batch.valid.sum().clamp(min=1)
         beside = self.further_losses(output, batch.state)
         loss = policy_loss + config.q_weight * q_loss + sum(beside.values())
-        guarded_step(loss, [self._adam, self._dual_adam], guard, clip=_CLIP)
-        self._updates += 1
-        if self._updates % config.target_period == 0:
-            self.target.load_state_dict(self.network.state_dict())
+        if guarded_step(loss, [self._adam, self._dual_adam], guard, clip=_CLIP) is not None:
+            self._updates += 1
+            if self._updates % config.target_period == 0:
+                self.target.load_state_dict(self.network.state_dict())
         losses = {name: value.item() for name, value in {"q_loss": q_loss, **beside}.items()}
         return {**losses, "mean_reward": batch.reward.mean().item()} | scalars(stats._asdict())
 

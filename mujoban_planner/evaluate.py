@@ -70,7 +70,8 @@ class Options:
     """Where the figures are written."""
 
     def __post_init__(self) -> None:
-        """Reject thinking less than once."""
+        """Reject thinking less than once and fewer than no levels."""
+        check_counts(self, "episodes", least=0)
         if self.thinking is not None:
             check_counts(self, "thinking")
 

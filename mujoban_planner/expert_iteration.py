@@ -51,7 +51,7 @@ class ExpertIterationConfig(LearnerConfig):
     def __post_init__(self) -> None:
         """Reject numbers with which nothing is learned, and what is no share."""
         super().__post_init__()
-        check_counts(self, "channels", "blocks", "first_evaluations")
+        check_counts(self, "first_evaluations")
         check_positive(self, "evaluations", "learning_rate", "horizon_seconds")
         check_shares(self, "warm_up")
 

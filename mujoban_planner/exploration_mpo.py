@@ -19,6 +19,7 @@ from torch import Tensor
 from mujoban_core.bodies import Body, get_body
 from mujoban_core.grid import Instruction
 from mujoban_core.look_around import WALKS, Scout, ScriptedScout
+from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.discrete_mpo import Answer, DiscreteMPOLearner, MPOBatch, StepStore
 from mujoban_planner.exploration_env import SHOWN, ExplorationEnvironment, ExplorationReward
@@ -70,6 +71,13 @@ class ExplorerConfig(PlayConfig):
     """CPU seconds after which the run is complete."""
     updates: float = 1e9
     """Updates after which it is complete."""
+
+    def __post_init__(self) -> None:
+        """Reject networks, levels and budgets of nothing, and what is no share."""
+        super().__post_init__()
+        check_counts(self, "channels", "blocks", "levels")
+        check_positive(self, "horizon", "cpu_seconds", "updates")
+        check_shares(self, "warm_up")
 
 
 class ExplorerActor(SequenceActor):

@@ -15,13 +15,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_core.ranges import check_positive
+from mujoban_core.ranges import check_not_negative, check_positive, check_shares
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import beginning
 from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.samples import Batch
+from mujoban_planner.teacher import HOPELESS
 from mujoban_planner.validation import NetworkConfig, success_rates
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, State, Trainer
@@ -58,11 +59,15 @@ class LearnerConfig(NetworkConfig):
     thoughts: tuple[int, ...] = (1,)
     """Thinking times, one for each batch in turns."""
     init: str | None = None
-    """Weights to start from, where names and shapes agree."""
+    """Weights to start from: of the same or fewer channels and blocks."""
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Reject what is no thinking time."""
+        """Reject networks of nothing, and what is no rate, no share and no thinking time."""
+        NetworkConfig.__post_init__(self)
+        check_positive(self, "learning_rate")
+        check_not_negative(self, "weight_decay", "plan_weight", "value_weight", "push_weight", "dead_weight")
+        check_shares(self, "warm_up", "ema")
         if not self.thoughts or min(self.thoughts) < 1:
             raise ValueError(f"--thoughts {' '.join(map(str, self.thoughts))}: expected numbers from 1")
 
@@ -89,8 +94,6 @@ class ImitationConfig(LessonConfig, LearnerConfig):
         check_positive(self, "cpu_seconds")
         if not 0.0 < self.bag_share <= 1.0:
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
-        if not 0.0 <= self.long <= 1.0:
-            raise ValueError(f"--long {self.long}: expected a share, from 0 to 1")
         if self.long_moves > _LONGEST:
             raise ValueError(f"--long-moves {self.long_moves}: expected at most {_LONGEST}, as few levels take more")
 
@@ -119,7 +122,7 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> t
         )
         dead = dead + verdicts / batch.push_known.sum().clamp(min=1)
     q_known = (batch.right | batch.dead).float()
-    q_target = torch.where(batch.dead, -1.0, batch.value[:, None])
+    q_target = torch.where(batch.dead, HOPELESS, batch.value[:, None])
     q = functional.smooth_l1_loss(output.q, q_target, reduction="none")
     q = (q * q_known).sum() / q_known.sum().clamp(min=1)
     push = output.push.flatten(1).gather(1, batch.next_push[:, None])[:, 0]

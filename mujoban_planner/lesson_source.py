@@ -15,12 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.training_levels import stream_number
 from mujoban_planner.uncertainty import Uncertainty, UncertaintyConfig
-from mujoban_planner.validation import NetworkConfig, Shares, difficulty_shares
+from mujoban_planner.validation import NetworkConfig, Shares, check_mix, difficulty_shares
 from mujoban_rl.actors import Actor, ActorPool, Experience
 from mujoban_rl.engine import Source, State
 
@@ -55,6 +56,15 @@ class LessonConfig(UncertaintyConfig):
     buffer: int = 2_000_000
     """Samples kept of demonstrations, and as many of corrections."""
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Reject lessons of nothing, and what is no share."""
+        super().__post_init__()
+        check_counts(self, "batch_size", "long_moves", "levels", "stock", "enough", "buffer")
+        check_counts(self, "seed", least=0)
+        check_shares(self, "corrections", "judged", "long")
+        check_positive(self, "freshness")
+        check_mix(self.mix)
 
 
 class LessonActor(Actor):

@@ -125,7 +125,8 @@ class LookAheadPlanner(Planner):
         searches = self._revived(memory)
         visits, means = split_memory(memory[_OWN:])
         boards, every = likeliest_boards(abstract_state), np.arange(len(plan))
-        holds = (state_keys(abstract_state) == expected) & (plan[every, cursor] != 0) & (boards.target == target)
+        here = state_keys(state_tensor(boards).numpy())  # without what cannot be, such as in walls
+        holds = (here == expected) & (plan[every, cursor] != 0) & (boards.target == target)
         for row in np.flatnonzero(holds).tolist():
             rest = plan[row, cursor[row] :]
             holds[row] = self._is_certain(abstract_state[row], boards, row, rest[rest != 0])

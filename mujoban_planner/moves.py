@@ -17,12 +17,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_core.grid import CHANNELS, GRID_SIZE
+from mujoban_core.ranges import check_shares
 from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.discrete_mpo import MPOSettings
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.training_levels import stream_number
-from mujoban_planner.validation import Shares, difficulty_shares
+from mujoban_planner.validation import Shares, check_mix, difficulty_shares
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
 from mujoban_rl.precision import autocast
@@ -42,6 +43,12 @@ class PlayConfig(MPOSettings):
     """Probability that an instruction fails, as with a real controller."""
     mix: Shares = (0.1, 0.1, 0.15, 0.2, 0.45)
     """Share of each difficulty among the training levels."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no share."""
+        super().__post_init__()
+        check_shares(self, "failure_rate")
+        check_mix(self.mix)
 
 
 class LevelStream:

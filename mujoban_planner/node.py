@@ -44,7 +44,7 @@ class PlannerNode(ModuleNode[Planner]):
         look_ahead_deadline: Seconds of a tick in which it searches, in the place of `look_ahead_per_tick`; 0 for none,
             as in lockstep. Fixed likewise.
         scout: What says where to look before pushing: scripted, learned or package.module:Class. Fixed likewise.
-        scout_weights: Weights file of the learned one; empty means those that ship. Fixed likewise.
+        scout_weights: Weights file of the learned one, which needs it: none ships. Fixed likewise.
     """
 
     role = "planner"
@@ -90,7 +90,7 @@ class PlannerNode(ModuleNode[Planner]):
         if self._scout is None:
             which = described("scripted, learned or package.module:Class", fixed=True)
             source = declare(self, "scout", SCRIPTED, which)
-            file = described("weights file of the learned scout; empty: those that ship", fixed=True)
+            file = described("weights file of the learned scout, which needs it", fixed=True)
             weights = declare(self, "scout_weights", "", file)
             self._scout = load_scout(source, Path(weights) if weights else None, body=self._body or None)
         return self._scout

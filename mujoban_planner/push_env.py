@@ -55,10 +55,10 @@ class PushEnvironment:
 
     Observation: `boards`, or abstract states by `boards.state_tensor`. Action: a push, int64 [B] in 0..255, one of
     `possible()`. Reward: +1 / -1 for a box pushed onto / off a target, +10 when solved, -0.01 per move. An episode
-    that is over stays as it is until `reset_to`.
+    that is solved or out of moves stays as it is until `reset_to`.
 
     An episode also ends where no solution is left at sight (a box that can reach no target, or is frozen off the
-    targets), since nothing is to be learned from what follows.
+    targets), since nothing is to be learned from what follows: `reset_to` is due then.
     """
 
     def __init__(self, batch: int, *, move_limit: int = MOVE_LIMIT) -> None:

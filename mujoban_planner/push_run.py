@@ -39,7 +39,7 @@ class PushRunConfig(NetworkConfig):
 
     def __post_init__(self) -> None:
         """Reject networks of nothing and seeds that there are not."""
-        check_counts(self, "channels", "blocks")
+        super().__post_init__()
         check_counts(self, "seed", least=0)
         check_not_negative(self, "anchor")
         check_shares(self, "anchored")

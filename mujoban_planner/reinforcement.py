@@ -22,6 +22,7 @@ from mujoban_core.ranges import check_not_negative, check_positive
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.discrete_mpo import MPOBatch, StepStore
+from mujoban_planner.growth import beginning
 from mujoban_planner.heads import silence_verdicts
 from mujoban_planner.move_learner import MoveLearner
 from mujoban_planner.moves import MoveActor, PlayConfig
@@ -52,6 +53,8 @@ class MPOConfig(PlayConfig, NetworkConfig):
 
     def __post_init__(self) -> None:
         """Reject what is no share, and a budget of nothing."""
+        PlayConfig.__post_init__(self)
+        NetworkConfig.__post_init__(self)
         check_positive(self, "cpu_seconds")
         check_not_negative(self, "anchor")
         if not 0.0 < self.bag_share <= 1.0:
@@ -111,11 +114,11 @@ class MPOLearner(MoveLearner):
     """A planner that learns over moves."""
 
     def __init__(
-        self, config: MPOConfig, *, device: torch.device | str = "cpu", init: LearnedPlanner | None = None
+        self, config: MPOConfig, *, device: torch.device | str = "cpu", init: Path | None = None
     ) -> None:
-        """Begin with a network that imitated, of the configuration's architecture, or with a new one."""
+        """Begin with the weights of a planner that imitated, for instance, or with a new network (`beginning`)."""
         torch.manual_seed(config.seed)  # the initial weights
-        network = init or config.build()
+        network = beginning(config, init).to(device)
         if init is None:
             silence_verdicts(network.heads)
         else:
@@ -138,8 +141,7 @@ def reinforcement(
     *,
     device: str = "cpu",
     actors: ActorOptions | None = None,
-    init: LearnedPlanner | None = None,
-    init_path: Path | None = None,
+    init: Path | None = None,
     bags: Sequence[Path] = (),
 ) -> Trainer[MPOBatch]:
     """Open or resume a run.
@@ -150,14 +152,13 @@ def reinforcement(
         cadence: How often it publishes, evaluates and saves.
         device: Device of the learner, and of actors that share its process.
         actors: Where actors play; by default in this process, by turns with the learner.
-        init: Network to start from, for example one that imitated; of the configuration's architecture.
-        init_path: Where it comes from, for the record.
+        init: Weights to start from, for example of one that imitated, of the same or fewer channels and blocks.
         bags: Directories of recorded bags whose transitions join the batches.
 
     Raises:
-        ValueError: If the directory belongs to another run, or a bag is not what is expected.
+        ValueError: If the directory belongs to another run, or weights or a bag are not what is expected.
     """
-    origin = {"path": init_path.name, "digest": digest(init_path)} if init_path else None
+    origin = None if init is None else {"path": init.name, "digest": digest(init)}
     run = RunDirectory(directory, config, beside={"init": origin})
     recorded = BagTransitions.read(bags) if bags else None
     learner = MPOLearner(config, device=device, init=init)
@@ -171,7 +172,7 @@ def reinforcement(
         "method": "mpo",
         "training": asdict(config),
         "init": origin,
-        "data": lineage(data, init_path),
+        "data": lineage(data, init),
         "bags_digest": bags_digest(bags),
     }
     return Trainer(run, learner, source, Budget(cpu_seconds=config.cpu_seconds), cadence, record=record)

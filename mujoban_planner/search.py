@@ -30,6 +30,7 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.shortening import shorten
 from mujoban_rl.compiled import CompiledGraph
 from mujoban_rl.precision import autocast
+from mujoban_sokoban.bitboard import SQUARES
 from mujoban_sokoban.solver_labels import moves_of
 
 _FIRST: Final = np.zeros(1, np.int64)
@@ -79,7 +80,7 @@ def grow(forest: Forest, rows: NDArray[np.int64], evaluate: Evaluation) -> None:
 def evaluate_boards(planner: LearnedPlanner, boards: BitBoards) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return how promising pushes are, as log-probabilities, [M, 4, I * I], and log p(alive), [M]."""
     states = state_tensor(boards)
-    if planner.compiled is not None and len(states) == 1:
+    if planner.compiled is not None and len(states) == planner.thinking == 1:
         return _judge_one(planner.compiled, states.numpy())
     push, alive = _judge(planner, states.to(planner.device))
     return push.cpu().numpy(), alive.cpu().numpy()
@@ -200,6 +201,7 @@ def _instructions(forest: Forest, starts: BitBoards, row: int) -> NDArray[np.int
     """Return the instructions of the solution that was found in a level, [T] or none."""
     start = (starts.box[row], int(starts.agent[row]))
     pushes = shorten(starts.wall[row], *start, forest.solution(row))
-    moves = np.zeros(forest.limit + 1, np.int64)
+    # The robot may walk on from where it stands now, farther than where the search began.
+    moves = np.zeros(forest.limit + SQUARES, np.int64)
     moves_of(~starts.wall[row], *start, pushes, np.random.default_rng(0), moves)
     return moves[: np.count_nonzero(moves)]

@@ -10,10 +10,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import torch
-
 from mujoban_core.files import write_atomically
-from mujoban_core.ranges import check_counts, check_positive
+from mujoban_core.ranges import check_positive
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.growth import beginning
 from mujoban_planner.imitation import ImitationConfig, imitation
@@ -68,16 +66,13 @@ def _imitation(settings: _Settings, place: _Place) -> Trainer[Any]:
 def _mpo(settings: _Settings, place: _Place) -> Trainer[Any]:
     options = settings.options
     init = options.pop("init")
-    path = None if init is None else Path(init)
-    torch.manual_seed(settings.seed)  # the weights that the network has beyond those that it starts from
     return reinforcement(
         MPOConfig(**options),
         place.run,
         replace(place.cadence, **MPO_PACE),
         device=place.device,
         actors=place.actors,
-        init=None if path is None else beginning(settings.network, path),
-        init_path=path,
+        init=None if init is None else Path(init),
     )
 
 
@@ -117,7 +112,7 @@ class StagesConfig(NetworkConfig):
 
     def __post_init__(self) -> None:
         """Reject networks of nothing, budgets of nothing, and what is no method or no share."""
-        check_counts(self, "channels", "blocks")
+        super().__post_init__()
         check_positive(self, "cpu_seconds")
         _ = self.parsed
 

@@ -22,7 +22,6 @@ import tyro
 
 from mujoban_core.program import read_options, run_command
 from mujoban_core.threads import set_threads
-from mujoban_planner import load
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore
 from mujoban_planner.imitation import ImitationConfig, imitation
@@ -102,7 +101,8 @@ class MPO(_ActorCommand):
     run: Path = Path("runs/planner_mpo")
     """Run directory; an existing one is resumed."""
     init: Path | None = None
-    """Weights to start from, such as those of an imitation; none trains by MPO alone."""
+    """Weights to start from, such as those of an imitation, of the same or fewer channels and blocks; none trains by
+    MPO alone."""
     bags: tuple[Path, ...] = ()
     """Recorded bags whose transitions join the replay."""
     device: str = "cpu"
@@ -113,10 +113,9 @@ class MPO(_ActorCommand):
 
     def main(self) -> None:
         """Train."""
-        init = load(self.init, self.device, compiled=False) if self.init is not None else None
         trainer = reinforcement(
             self.config, self.run, self.cadence(**MPO_PACE), device=self.device,
-            actors=self.actors, init=init, init_path=self.init, bags=self.bags,
+            actors=self.actors, init=self.init, bags=self.bags,
         )  # fmt: skip
         trainer.run(limit_seconds=self.seconds, limit_updates=self.updates)
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Final, Literal, Self, cast, get_args
 
+from mujoban_core.ranges import check_counts
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
@@ -22,6 +24,12 @@ Architecture = Literal["residual", "thinking", "recurrent"]
 
 Shares = tuple[float, float, float, float, float]
 """Shares of difficulties 1 to 5 among levels."""
+
+
+def check_mix(shares: Shares) -> None:
+    """Raise ValueError unless these are shares of difficulties that levels can be drawn by."""
+    if not all(0.0 <= share < math.inf for share in shares) or not sum(shares):
+        raise ValueError(f"mix is {' '.join(map(str, shares))}: expected five shares from 0 on, not all 0")
 
 
 def difficulty_shares(shares: Shares) -> dict[int, float]:
@@ -50,6 +58,10 @@ class NetworkConfig:
 
     judge: bool = True
     """Judge each push where the box is (with propagation)."""
+
+    def __post_init__(self) -> None:
+        """Reject networks of nothing."""
+        check_counts(self, "channels", "blocks", "tied", "depth", "repeats")
 
     @classmethod
     def of(cls, weights: Path) -> Self:

@@ -50,6 +50,20 @@ def test_shards_learn_what_the_whole_batch_teaches():
         np.testing.assert_allclose(row, whole[0], atol=1e-4)
 
 
+def test_an_episode_that_begins_in_a_refused_batch_does_not_go_on_with_the_memory_of_another():
+    learner = EstimatorLearner(TrainConfig(streams=1, length=4, warm_up=0.0))
+    batches = Batcher([iter([stretch(4), stretch(4), stretch(4, first=False)])], 4, BALL)
+    former, begins, goes_on = (next(batches) for _ in range(3))
+    assert [bool(b.first[0]) for b in (former, begins, goes_on)] == [True, True, False]
+    learner.update(former, 0.5, NaNGuard())
+    learner.update(begins._replace(proprio=begins.proprio * np.nan), 0.5, NaNGuard())
+    (shard,) = learner._shards(goes_on)
+    assert all(torch.equal(*both) for both in zip(shard.belief, learner.estimator.initial_belief(1), strict=True))
+    learner.update(goes_on, 0.5, NaNGuard())
+    (shard,) = learner._shards(goes_on)
+    assert torch.equal(shard.belief[0], learner.state().tensors["belief.hidden"])
+
+
 def test_estimator_and_termination_must_share_the_resnet():
     with pytest.raises(ValueError, match="channels"):
         LearnerConfig(termination=TerminationConfig(channels=8))

@@ -112,6 +112,10 @@ def test_more_thinking_time_is_not_that_of_the_graph(small):
     before = _scores(planner, state)
     planner.thinking = 4
     assert not np.allclose(_scores(planner, state), before, atol=1e-3)
+    boards = bit_boards(take_levels(LEVELS, np.array([0, 0])))
+    one = type(boards)._make(column[:1] for column in boards)
+    for alone, both in zip(evaluate_boards(planner, one), evaluate_boards(planner, boards), strict=True):
+        assert np.allclose(alone[0], both[0], atol=1e-4), "a search that is alone thinks as those side by side"
 
 
 def test_a_copy_has_the_graph_as_well(small):

@@ -15,7 +15,7 @@ from mujoban_planner.lookahead import LookAheadPlanner
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.planner import split_memory
 from mujoban_planner.play import play
-from mujoban_planner.search import advance, search
+from mujoban_planner.search import LoneSearch, advance, search
 from mujoban_sokoban import rules
 from mujoban_sokoban.generator import generate_batch, generate_level
 from mujoban_sokoban.levels import Level, stack_levels, write_levels
@@ -208,6 +208,26 @@ def test_what_a_plan_has_left_behind_need_not_be_certain(planner):
     assert (after[0] == memory[0]).all()
 
 
+def test_a_plan_is_followed_although_an_estimate_holds_what_cannot_be(planner):
+    wall = (3, 4)
+    _, _, memory = first_plan(planner, corridor(wall, 3, 0.6))
+    assert memory[0].any()
+    states = corridor(wall, 3, 0.6, Level.from_text("########\n# @$ .##\n########"))
+    _, after = LookAheadPlanner(planner, 400).decide(states, memory)
+    assert (after[0] == memory[0]).all()
+
+
+def test_a_robot_far_from_where_a_search_began_gets_a_solution_longer_than_its_limit(planner):
+    level = Level.from_text("########\n#      #\n#      #\n#      #\n#      #\n#@$.   #\n#      #\n########")
+    begun = LoneSearch(bit_boards(stack_levels([level])), 100, 3)
+    advance([begun], planner, 100)
+    assert len(begun.solution(int(begun.start.agent[0]))) == 1
+    moved = level.to_text().replace("@", " ").replace("#      #", "#     @#", 1)
+    far = bit_boards(stack_levels([Level.from_text(moved)]))
+    found = begun.solution(int(far.agent[0]))
+    assert len(found) > 4 and found[-1] == Instruction.EAST
+
+
 def test_only_the_learned_planner_thinks_longer(planner):
     assert Deliberation(look_ahead=0).prepare(planner) is planner and planner.thinking == 1
     assert Deliberation().prepare(planner).expansions == LOOK_AHEAD
@@ -257,6 +277,7 @@ def test_evaluate_reports_rate_interval_and_optimality(tmp_path, capsys):
         ("--weights", "missing.safetensors"),
         ("--seed", 10**7),
         ("--thinking", -3),
+        ("--episodes", -1),
     ],
 )
 def test_bad_input_ends_evaluate_with_one_line_and_status_2(arguments, capsys):

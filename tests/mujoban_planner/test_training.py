@@ -137,9 +137,8 @@ def test_hidden_states_show_what_was_in_view_and_guess_the_rest():
 
 def _mpo(path, start=None, **changes):
     small = {"environments": 8, "batch_size": 8, "warm_up_steps": 8, "replay_steps": 50, "play": 3, "n_step": 2}
-    config = MPOConfig(channels=8, blocks=1, failure_rate=0.1, **small | changes)
-    network = None if start is None else mujoban_planner.load(start, compiled=False)
-    return reinforcement(config, path, init=network, init_path=start)
+    config = MPOConfig(**{"channels": 8, "blocks": 1, "failure_rate": 0.1, **small, **changes})
+    return reinforcement(config, path, init=start)
 
 
 def test_mpo_writes_a_loadable_planner(tmp_path):
@@ -155,7 +154,9 @@ def test_mpo_that_is_terminated_and_resumed_equals_one_that_never_stopped(tmp_pa
 
 
 def test_mpo_refuses_a_batch_with_nan(tmp_path):
-    check_refusal(_mpo(tmp_path), lambda batch: batch._replace(reward=batch.reward * math.nan))
+    trainer = _mpo(tmp_path)
+    check_refusal(trainer, lambda batch: batch._replace(reward=batch.reward * math.nan))
+    assert trainer.learner.state().values == {"updates": 2}, "the refused batch counts as none of the three"
 
 
 @pytest.mark.parametrize("propagation", [True, False])
@@ -167,6 +168,15 @@ def test_a_planner_by_mpo_alone_is_not_led_by_verdicts_that_nobody_taught_it(pro
         planner.caution = caution
         scores.append(planner.scores(states, count_visits(states, initial_visits(16)), initial_means(16))[0])
     assert np.allclose(*scores, atol=1e-5)
+
+
+def test_mpo_goes_on_from_weights_with_the_network_that_its_options_name(tmp_path):
+    _mpo(tmp_path / "first").save()
+    first = tmp_path / "first" / "planner.safetensors"
+    _mpo(tmp_path / "larger", first, channels=12, blocks=2).save()
+    assert mujoban_planner.load(tmp_path / "larger" / "planner.safetensors").config["channels"] == 12
+    with pytest.raises(WeightsError, match="expected a ResidualPlanner with at most the channels"):
+        _mpo(tmp_path / "smaller", first, channels=4)
 
 
 def test_mpo_after_imitation_gives_stay_a_chance():
@@ -300,6 +310,17 @@ def test_every_method_has_a_budget_of_cpu_seconds_and_evaluations_by_samples(tmp
         ("expert-iteration", "--questions", "-1"),
         ("expert-iteration", "--easy", "nan"),
         ("expert-iteration", "--evaluations", "0"),
+        ("imitation", "--levels", "0"),
+        ("imitation", "--batch-size", "0"),
+        ("imitation", "--blocks", "0"),
+        ("imitation", "--corrections", "1.5"),
+        ("imitation", "--learning-rate", "0.0"),
+        ("mpo", "--play", "0"),
+        ("mpo", "--n-step", "0"),
+        ("mpo", "--environments", "0"),
+        ("mpo", "--failure-rate", "-0.1"),
+        ("explorer", "--levels", "0"),
+        ("explorer", "--horizon", "0.0"),
     ],
 )
 def test_an_option_out_of_its_range_is_named_before_anything_begins(tmp_path, capsys, method, option, value):
@@ -309,6 +330,13 @@ def test_an_option_out_of_its_range_is_named_before_anything_begins(tmp_path, ca
     name = option[2:].replace("-", "_")
     assert f"{name} is {value}" in error and "expected" in error and len(error.splitlines()) == 1
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("method", ["imitation", "mpo", "explorer"])
+def test_a_mix_of_no_levels_is_named(tmp_path, capsys, method):
+    arguments = [method, "--run", str(tmp_path / "run"), "--mix", "0", "0", "0", "0", "0"]
+    assert exit_status("train", partial(train.main, arguments)) == 2
+    assert "mix is 0.0 0.0 0.0 0.0 0.0: expected five shares" in capsys.readouterr().err
 
 
 def test_a_larger_network_begins_with_what_a_smaller_one_says(tmp_path):
