@@ -113,6 +113,8 @@ class MonitorNode(GraphNode):
         self._join = Synchroniser([t.name for t in watched], depth=64)
         self._log = EpisodeLog(0)
         self._sequence = 0
+        self._first = 0
+        """Stamp of the first tick of the episode that was heard [ns]."""
         self._joined = -1
         self._end: EpisodeTruth | None = None
         self._doubted: EpisodeTruth | None = None
@@ -162,6 +164,7 @@ class MonitorNode(GraphNode):
         self._started = self._started or time.perf_counter()
         if self.episode is None or message.episode != self.episode.episode:
             self._log, self._sequence = EpisodeLog(message.seed), 0
+            self._first = conversions.stamp_of(message)
         elif message.header.stamp == self.episode.header.stamp:
             self._confirm()  # the simulator offers the tick again
             return
@@ -178,7 +181,8 @@ class MonitorNode(GraphNode):
         self.ticks += 1
         if self.ticks - self._doubted_at > _REFUTED:
             self._doubted = None  # the episode does go on
-        said = None if tick.alone else tick.instruction
+        # In real time the last answers of an episode may come after the next one has begun.
+        said = None if tick.alone or self._joined < self._first else tick.instruction
         if said is not None and said.sequence != self._sequence:
             self._sequence = said.sequence
             self._log.decided(tick.truth, tick.estimate, said.direction, tick.termination.timed_out)

@@ -87,6 +87,7 @@ class Reporting:
         Raises:
             OSError: If it cannot be written.
         """
+        self.results = ()  # they are told
         content = report(results, self._weights, **self._game, **extra)
         if self._generated:
             from mujoban_rl.sealed_levels import noted_use
@@ -104,7 +105,7 @@ class Reporting:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Report what there is after an interruption."""
-        if isinstance(value, KeyboardInterrupt) and self.results:
+        """Report what there is after an interruption or an error: also that test levels were used."""
+        if isinstance(value, KeyboardInterrupt | Exception) and self.results:
             with StopSignal():
                 self.finish(sorted(self.results, key=lambda result: result.seed), interrupted=self._asked)

@@ -118,12 +118,23 @@ def check_file(option: str, path: Path | None) -> None:
     _check_room(option, path, folder)
 
 
-def check_folder(option: str, path: Path | None) -> None:
-    """Check that a new folder can be made, with those above it; see `check_file`."""
+def check_folder(option: str, path: Path | None, *, may_exist: bool = False) -> None:
+    """Check that a new folder can be made, with those above it; see `check_file`.
+
+    Args:
+        option: Which names it.
+        path: The folder; None is fine.
+        may_exist: Whether it may be there already, empty.
+
+    Raises:
+        ValueError: If not.
+    """
     if path is None:
         return
     if path.exists() and not path.is_dir():
         raise ValueError(f"{option} {path}: is a file, expected a new folder")
+    if path.exists() and not may_exist:
+        raise ValueError(f"{option} {path}: exists, expected a new folder")
     if path.exists() and any(path.iterdir()):
         raise ValueError(f"{option} {path}: is not empty, expected a new folder")
     above = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())

@@ -127,6 +127,7 @@ class SimulatorNode(GraphNode):
         self._place = Place(stamp=self.run)
         self._torque: NDArray[np.float32] | None = None
         self._held_torque = np.zeros(self.world.body.action_size, np.float32)
+        self._first = 0  # stamp of the episode's first tick, before which no answer is meant for it
         self._instruction: conversions.InstructionReading | None = None
         self._in_force = conversions.InstructionReading(0, 0)
         awaited = {"await_recorder": topics.RECORDED, "await_monitor": topics.MONITORED}
@@ -219,6 +220,7 @@ class SimulatorNode(GraphNode):
         self.world.reset([0], [self.episodes[index]])
         self._held_torque[:] = 0.0
         self._in_force = conversions.InstructionReading(0, 0)
+        self._first = self._stamp + TICK
         self._next()
 
     def _next(self) -> None:
@@ -327,13 +329,14 @@ class SimulatorNode(GraphNode):
         if message.stamp == self._stamp:
             self._torque = message.content
             self._proceed()
-        elif self._speed > 0 and self._torque is None:
+        elif self._speed > 0 and self._torque is None and message.stamp >= self._first:
             self._held_torque = message.content
 
     def _on_instruction(self, message: Received) -> None:
         if not self._is_known(message.stamp, topics.INSTRUCTION.name):
             return
-        if message.stamp == self._stamp or (self._speed > 0 and self._instruction is None):
+        late = self._speed > 0 and self._instruction is None and message.stamp >= self._first
+        if message.stamp == self._stamp or late:
             self._instruction = message.content
             self._proceed()
 
@@ -368,13 +371,14 @@ class SimulatorNode(GraphNode):
     # Services
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._started is not None and not self.finished.done()
+        running = self._started is not None and not self.finished.done()
+        response.success = running and not self._ended
         if response.success:
             self._begin(self._place.index)
             spec = self.episodes[self._place.index]
             response.message = f"episode {self._place.starts} starts with seed {spec.seed}"
         else:
-            response.message = "no episode is running"
+            response.message = "the episode has ended, the next one follows" if running else "no episode is running"
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

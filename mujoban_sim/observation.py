@@ -67,8 +67,11 @@ class ObservationPublisher:
 
     def _is_wanted(self, topic: Topic, stamp: int) -> bool:
         readers = self._publishers[topic].get_subscription_count()
-        if topic is not topics.TOP_CAMERA or not readers:
+        if topic is not topics.TOP_CAMERA:
             return readers > 0
+        if not readers:
+            self._top_readers = 0  # whoever comes next may want more
+            return False
         if readers != self._top_readers:
             known = self._node.get_subscriptions_info_by_topic(topic.name)
             # Not all may be known yet: then they are looked at again in the next tick.

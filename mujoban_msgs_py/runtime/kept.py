@@ -46,6 +46,10 @@ class KeptArrays:
             if is_due(node, "not kept", _LOG_PERIOD):
                 node.get_logger().warning(f"{self.path}: {error.strerror}; after a crash this node would start anew")
 
+    def remove(self) -> None:
+        """Forget what was kept."""
+        self.path.unlink(missing_ok=True)
+
     def read(self, take: Callable[[dict[str, NDArray[Any]]], Kept]) -> Kept | None:
         """Return what `take` makes of the arrays, or None if there are none yet.
 

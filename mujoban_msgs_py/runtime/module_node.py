@@ -203,6 +203,10 @@ class ModuleNode(TickNode, Generic[ModuleT]):
             self.counts["refused weights"] += 1
             return SetParametersResult(successful=False, reason=str(error))
         self.module, self.state = module, None
+        if self._kept is not None:
+            # The process after this one begins with the weights of the start, which may remember otherwise.
+            self._kept.remove()
+            self._kept = None
         self.counts["reloads"] += 1
         self.get_logger().info(f"loaded {weights or 'the weights that ship'} on {device}")
         return SetParametersResult(successful=True)

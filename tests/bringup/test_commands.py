@@ -19,6 +19,7 @@ from bringup import evaluate, record, run_stack, train
 from bringup.command import Stack, recorded_seed
 from bringup.options import EpisodeOptions
 from bringup.reporting import Reporting, played
+from bringup.results import EpisodeResult
 from mujoban_controller import teacher_weights
 from mujoban_core.bodies import ANT
 from mujoban_core.files import digest
@@ -31,7 +32,7 @@ from mujoban_msgs_py.topics import GRAPH_TOPICS
 from mujoban_planner.deliberation import Deliberation
 from mujoban_sim import rendering
 from mujoban_sokoban.episodes import Episodes
-from mujoban_sokoban.generator import TRAIN_SEEDS
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
 from mujoban_sokoban.levels import Level, write_levels
 
 ALL_ORACLES = ["--oracle", "estimator,termination,planner,controller"]
@@ -139,7 +140,7 @@ def test_an_interrupted_evaluation_reports_what_it_has(tmp_path):
         (["--json", "no/folder/report.json"], "no such folder"),
         (["--json", "."], "is a folder"),
         (["--video", "no/film.mp4"], "no such folder"),
-        (["--record", "."], "is not empty"),
+        (["--record", "."], "exists, expected a new folder"),
         (["--record", "/proc/bag"], "expected a place that can be written to"),
     ],
 )
@@ -162,6 +163,27 @@ def test_seeds_of_two_ranges_are_refused_before_anything_is_played(capfd, monkey
     write_levels(levels, [Level.from_text(UNSOLVABLE)])
     filed = Episodes(2, 4_999_999, level_file=levels)
     Reporting(None, {}, filed, played(Stack(), filed, EpisodeOptions()))  # seeds say nothing of a file's levels
+
+
+def test_what_was_played_before_an_error_is_reported_and_that_test_levels_were_used(tmp_path, capfd):
+    result = EpisodeResult(1000, True, 11.0, 5, 1, 0, 0, None)
+    episodes = Episodes(4, 1000)
+    reporting = Reporting(tmp_path / "report.json", {}, episodes, played(Stack(), episodes, EpisodeOptions()))
+    with pytest.raises(OSError, match="disk"), reporting:
+        reporting.results = [result]
+        raise OSError("the disk is full")
+    content = json.loads((tmp_path / "report.json").read_text())
+    assert content["interrupted"] == 4 and content["test_uses"][0]["seeds"] == [1000, 1000]
+    assert capfd.readouterr().out.count("solved 1 of 1") == 1
+
+
+def test_of_a_file_only_the_levels_that_are_played_are_looked_through(tmp_path, monkeypatch, capsys):
+    levels = tmp_path / "levels.txt"
+    write_levels(levels, [generate_level(1, 1000), Level.from_text(UNSOLVABLE), generate_level(1, 1001)])
+    EpisodeOptions(levels=levels, episodes=1).make(3)
+    assert not capsys.readouterr().err
+    EpisodeOptions(levels=levels, episodes=2).make(0)
+    assert "level 1 of" in capsys.readouterr().err
 
 
 def test_a_report_goes_through_a_device_and_never_replaces_it(tmp_path, capfd):

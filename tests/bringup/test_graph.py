@@ -5,6 +5,7 @@ import re
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from bringup.graph import NODES, InProcess, Processes
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.listening import ANOTHER_RUN
+from mujoban_msgs_py.listening import ANOTHER_RUN, Received
 from mujoban_msgs_py.run_identifier import run_of
 from mujoban_msgs_py.topics import TICK
 from mujoban_sokoban.episodes import Episodes
@@ -208,6 +209,41 @@ def test_reset_starts_the_same_episode_again(play_graph):
     episodes = graph.said.episodes.values()
     assert [e.episode for e in episodes if e.step == 0] == [1, 2]
     assert len({(e.seed, e.level) for e in episodes}) == 1
+
+
+def test_an_episode_that_has_ended_is_not_reset_but_followed_by_the_next(play_graph):
+    graph = play_graph(episodes=Episodes(2, 47, difficulty=2), time_limit=30)
+    assert graph.call(SetBool, "/pause", SetBool.Request(data=True)).success
+    while not graph.simulator.world.done[0]:
+        due = graph.simulator.ticks + 1
+        graph.call(Trigger, "/step", Trigger.Request())
+        graph.spin_until(lambda due=due: graph.simulator.ticks == due)
+    refused = graph.call(Trigger, "/reset", Trigger.Request())
+    assert not refused.success and "the next one follows" in refused.message
+    assert graph.call(SetBool, "/pause", SetBool.Request(data=False)).success
+    assert [result.seed for result in graph.finish()] == [47, 48]
+
+
+def test_answers_that_come_after_an_episodes_end_are_not_taken_for_those_of_the_next(play_graph):
+    graph = play_graph(names=["simulator"], episodes=Episodes(2, 47, difficulty=2), realtime=1.0, hold_limit=3)
+    simulator, monitor = graph.simulator, graph.monitor
+    simulator._begin(0)
+    late = simulator._stamp
+    simulator._begin(1)
+    simulator._on_torque(Received(late, np.array([1.0, -1.0], np.float32), b""))
+    simulator._on_instruction(Received(late, conversions.InstructionReading(37, 2), b""))
+    assert not simulator._held_torque.any() and simulator._instruction is None
+    graph.spin_until(lambda: monitor.episode is not None and monitor.stamp == simulator._stamp)
+    state = Episodes(1, 47, difficulty=2)[0].level.abstract_state()
+    said = SimpleNamespace(
+        alone=False, instruction=conversions.InstructionReading(37, 2), truth=state, estimate=state,
+        termination=SimpleNamespace(timed_out=False),
+    )  # fmt: skip
+    for stamp, decisions in ((late, 0), (monitor.stamp, 1)):
+        monitor._joined = stamp
+        monitor._on_tick(said)
+        log = monitor._log.result(solved=False, steps=1, episode_return=0.0, last=state)
+        assert log.instructions == decisions
 
 
 @pytest.mark.parametrize("effort", [[float("nan"), 0.0], [0.0, 1.5], [0.0]])

@@ -144,6 +144,22 @@ def test_the_view_from_above_is_drawn_as_often_as_its_readers_need(play_graph, r
     assert set(np.diff(shown)) == {period * topics.TICK}
 
 
+def test_who_follows_a_glance_at_the_view_from_above_may_need_all_of_it(play_graph):
+    graph = play_graph(episodes=Episodes(4, 0, difficulty=2))
+    node, topic = graph.graph.add(Node("watcher")), topics.TOP_CAMERA
+    for reliability, period in (("BEST_EFFORT", GLANCE), ("RELIABLE", 1)):
+        stamps = []
+        qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy[reliability])
+        heard = node.create_subscription(
+            topic.type, topic.name, lambda m, stamps=stamps: stamps.append(conversions.stamp_of(m)), qos
+        )
+        graph.spin_until(lambda stamps=stamps: len(stamps) > 8)
+        assert set(np.diff(list(dict.fromkeys(stamps[4:])))) == {period * topics.TICK}
+        node.destroy_subscription(heard)
+        before = graph.simulator.ticks
+        graph.spin_until(lambda before=before: graph.simulator.ticks > before + 2)
+
+
 def test_the_view_from_above_has_as_many_pixels_to_a_metre_with_every_body():
     modules = {role: Choice(role, "oracle") for role in ROLES}
     ball, ant = (top_camera_size(Stack(modules, body=body), filmed=False) for body in ("ball", "ant"))
