@@ -19,10 +19,17 @@ from torch.nn import functional
 
 from mujoban_baselines.agents import MonolithicAgent
 from mujoban_baselines.networks import Recurrent
-from mujoban_core.ranges import check_counts
+from mujoban_core.ranges import check_counts, check_positive
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
-from mujoban_msgs_py.bags.training import bag_digest, episodes, find_bags, open_training_bag
+from mujoban_msgs_py.bags.training import (
+    bag_digest,
+    episodes,
+    find_bags,
+    open_training_bag,
+    require_about,
+    require_training_seeds,
+)
 from mujoban_rl.engine import Learner, Scalars, Source, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_cosine
@@ -54,14 +61,17 @@ class CloningConfig:
     def __post_init__(self) -> None:
         """Reject batches without a tick."""
         check_counts(self, "rows", "window")
+        check_counts(self, "normalised", least=0)
+        check_positive(self, "rate", "clip")
 
 
 class BagSource(Source[Batch]):
     """The next W ticks of R episodes at a time."""
 
     def __init__(
-        self, paths: Sequence[Path], agent: MonolithicAgent, config: CloningConfig, rng: np.random.Generator
-    ) -> None:
+        self, paths: Sequence[Path], agent: MonolithicAgent, config: CloningConfig, rng: np.random.Generator,
+        about: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
         """Read bags.
 
         Args:
@@ -69,12 +79,17 @@ class BagSource(Source[Batch]):
             agent: Who copies; bags have to be of its body.
             config: Rows and ticks.
             rng: Draws the order of the bags.
+            about: Body and world that bags have to be of, by `body` and `world`.
 
         Raises:
-            BagError: If there is no bag at a path, or one lacks a topic.
+            BagError: If there is no bag at a path, or one lacks a topic, is of another body or world, or begins with a
+                level that is not for training.
         """
         self._sizes, self._window = (agent.proprio_size, agent.action_size), config.window
         bags = [open_training_bag(path, TOPICS) for path in find_bags(paths)]
+        for bag in bags:
+            require_training_seeds(bag)
+            require_about(bag, about or {}, "--{}")
         self._episodes = EndlessEpisodes(bags, self._read, rng, config.rows, lambda bag: bag_digest(bag.path))
 
     def _read(self, bag: Bag) -> Iterator[Fields]:

@@ -73,7 +73,7 @@ class MPOTrainingConfig:
     def __post_init__(self) -> None:
         """Reject windows in which nothing is learned, an odd number of samples, and numbers out of their range."""
         check_samples(self.samples)
-        check_counts(self, "windows", "n_step", "target_period")
+        check_counts(self, "windows", "n_step", "target_period", "replay")
         check_counts(self, "warm_up", "first", "critic_first", "normalised", least=0)
         check_shares(self, "gamma")
         check_positive(self, "gamma", "reuse", "rate", "clip")
@@ -167,7 +167,9 @@ class MPOLearner(Learner[Batch]):
         weighed = self._beside.submit(self._weigh, batch)
         online = self._over(self.agent, batch, warm)
         target, action, q = weighed.result()
-        critic_loss = self._critic_loss(batch, online, q.mean(0))
+        alone = self._updates < config.critic_first
+        # Alone, it must not change the torso that it may share with the policy.
+        critic_loss = self._critic_loss(batch, online.features.detach() if alone else online.features, q.mean(0))
         policy = online.action
         if self.critic.teaches_torso:
             # Each change that the critic makes to the torso would be one of the policy, and the bounds on these stop
@@ -177,12 +179,11 @@ class MPOLearner(Learner[Batch]):
             _flat(policy), _flat(x[:, warm:] for x in target.action),
             action[:, :, warm:].flatten(1, 2), q[:, :, warm:].flatten(1),
         )  # fmt: skip
-        loss = critic_loss + policy_loss if self._updates >= config.critic_first else critic_loss
+        loss = critic_loss if alone else critic_loss + policy_loss
         norm = guarded_step(loss, [self._adam, self._dual_adam], guard, clip=config.clip)
         if norm is None:
             return {}
-        if self._updates < config.normalised:
-            self._normalise(batch["proprio"][:, 0])
+        self._normalise(batch["proprio"][:, 0])
         self._updates += 1
         if self._updates % config.target_period == 0:
             self.target_agent.load_state_dict(self.agent.state_dict())
@@ -207,7 +208,7 @@ class MPOLearner(Learner[Batch]):
                 memory = agent(before, memory, first[:, :skipped]).memory
         return agent({name: values[:, skipped:] for name, values in sights.items()}, memory, first[:, skipped:])
 
-    def _critic_loss(self, batch: Batch, online: AgentOutput, value: Tensor) -> Tensor:
+    def _critic_loss(self, batch: Batch, features: Tensor, value: Tensor) -> Tensor:
         """Return half the mean squared error of Q in the ticks that a return starts from, given V [M, W]."""
         warm, n = self.config.warm_up, self.config.n_step
         starts = value.shape[1] - warm - n
@@ -218,7 +219,7 @@ class MPOLearner(Learner[Batch]):
         row = torch.arange(len(value)).repeat_interleave(starts)
         target = returns.reward + returns.bootstrap * value[row, warm + reached]
         begun = {name: later[name][:, :starts] for name in (*self.critic.sees, "action")}
-        state = self.critic.state(begun, online.features[:, :starts])
+        state = self.critic.state(begun, features[:, :starts])
         predicted = self.critic(state, begun["action"]).flatten()
         # What was dropped may be followed by anything.
         error = torch.where(returns.valid, predicted - target, 0.0)
@@ -236,7 +237,10 @@ class MPOLearner(Learner[Batch]):
         """Take in what is felt, for online and target networks alike: what they compute would differ otherwise."""
         senses = (self.agent.sense, self.target_agent.sense), (self.critic.sense, self.target_critic.sense)
         for online, target in senses:
-            if online is not None and target is not None:
+            if online is None or target is None:
+                continue
+            # A sense that has been normalised, as that of a clone, stays as it is.
+            if int(online.normaliser.count) < self.config.normalised * len(proprio):
                 online.normaliser.update(proprio)
                 target.normaliser.load_state_dict(online.normaliser.state_dict())
 

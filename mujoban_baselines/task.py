@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import TOP_DOWN_CAMERA
 from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
+from mujoban_core.ranges import check_counts
 from mujoban_rl.engine import State
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
@@ -34,6 +35,8 @@ LEVELS: Final[dict[str, dict[int, float]]] = {
 """How often each difficulty is drawn (paper D.1)."""
 MAX_BOXES: Final = max(boxes for _, boxes in DIFFICULTIES.values())
 """K: all levels are played in one world."""
+_LONGEST: Final = 1e6
+"""Seconds that no episode takes."""
 
 
 class TaskStep(NamedTuple):
@@ -97,9 +100,11 @@ class TaskConfig:
 
     def __post_init__(self) -> None:
         """Reject what nobody can play."""
-        if self.robots < 1 or self.steps < 1:
-            lengths = f"robots {self.robots}, episode_seconds {self.episode_seconds}"
-            raise ValueError(f"{lengths}: expected at least 1 and {CONTROL_PERIOD}")
+        check_counts(self, "robots")
+        if self.episode_seconds is not None and not CONTROL_PERIOD <= self.episode_seconds < _LONGEST:
+            raise ValueError(
+                f"episode_seconds is {self.episode_seconds}: expected from {CONTROL_PERIOD} to less than {_LONGEST:g}"
+            )
 
     @property
     def steps(self) -> int:

@@ -42,6 +42,7 @@ from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import load_weights, origin, provenance
+from mujoban_sim.presets import DEFAULT_WORLD
 
 PROG = "mujoban_baselines.train"
 Size = Literal["S", "M", "L"]
@@ -111,6 +112,8 @@ class CloneRunConfig(RunConfig):
     body: str = "ball"
     size: Size = "S"
     """Variant of the network."""
+    world: str = DEFAULT_WORLD
+    """Of the bags."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
 
 
@@ -172,11 +175,12 @@ def clone_parts(config: CloneRunConfig, bags: Sequence[Path]) -> Parts:
     """Return learner and source of a cloning from bags.
 
     Raises:
-        BagError: If there is no bag at a path, or one lacks a topic.
+        BagError: If there is no bag at a path, or one lacks a topic, is of another body or world, or not for training.
     """
     torch.manual_seed(config.seed)  # the initial weights
     agent = MonolithicAgent(config.body, config.size)
-    source = BagSource(bags, agent, config.cloning, np.random.default_rng(config.seed))
+    about = {"body": config.body, "world": config.world}
+    source = BagSource(bags, agent, config.cloning, np.random.default_rng(config.seed), about)
     return CloningLearner(agent, config.cloning), source
 
 
@@ -193,12 +197,12 @@ def make_trainer(
         cadence: How often it logs, publishes and saves.
         method: Its name.
         data: What it learns from beside what `config` says, for the record.
-        start: Digest of the weights that it starts from, or of each of them by name, for the record.
+        start: Digest of the weights that it starts from, or of each of them by name.
     """
-    directory = RunDirectory(run, config, beside={"method": method})
+    directory = RunDirectory(run, config, beside={"method": method, "origins": start})
     record = {
         **provenance(),
-        "training": directory.config,
+        "training": {name: value for name, value in directory.config.items() if name != "origins"},
         "start": start,
         **config.data,
         **(data or {}),
@@ -256,7 +260,7 @@ class Clone(_Command):
             raise ValueError("--bags is missing, expected bags or folders of bags")
         parts = clone_parts(self.config, self.bags)
         names = ", ".join(bag.name for bag in self.bags)
-        data = {"data": f"bags {names}", "bags_digest": bags_digest(self.bags)}
+        data = {"data": f"bags {names}", "bags_digest": bags_digest(self.bags), "world": self.config.world}
         return make_trainer(self.config, parts, self.run, self.cadence(100, 1000), "cloning", data=data)
 
 

@@ -190,6 +190,10 @@ class LessonSource(Source[Batch]):
         for kind, buffer in self._buffers.items():
             buffer.restore(state.part(kind))
 
+    def go_on(self, state: State) -> None:
+        """Have lessons made of other levels than so far."""
+        self._pool.go_on(state.part("pool"))
+
     def worker_cpu_seconds(self) -> float:
         """Return the CPU time of the processes that make lessons, as far as they have delivered."""
         return self._pool.cpu_seconds

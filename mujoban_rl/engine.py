@@ -140,6 +140,9 @@ class Source(_Part, Generic[BatchT]):
         """Return the CPU time that processes of this source have used so far in this bit of the run."""
         return 0.0
 
+    def go_on(self, state: State) -> None:
+        """Take over what a light copy holds of a state, so that nothing comes that came before."""
+
     def close(self) -> None:
         """End processes and close files."""
 
@@ -173,7 +176,9 @@ class Cadence:
                 raise ValueError(f"{verb} every {seconds} seconds: expected a number of 0 or more")
 
 
-CARRIED: Final = ("progress", "metrics", "skipped", "due", "learner.best")
+CARRIED: Final = (
+    "progress", "metrics", "skipped", "due", "learner.best", "source.pool.next_stream", "source.pool.pool.next_stream",
+)  # fmt: skip
 """What a light copy of a checkpoint holds beside its modules (see `mujoban_rl.run_directory.copy_light`)."""
 
 
@@ -381,6 +386,8 @@ class Trainer(Generic[BatchT]):
             if snapshot.light:
                 if "best" in snapshot.extra.get("learner", {}):
                     self.learner.restore_best(state.part("learner").part("best"))
+                if "source" in snapshot.extra:
+                    self.source.go_on(state.part("source"))
             else:
                 for name, part in parts.items():
                     part.restore(state.part(name))

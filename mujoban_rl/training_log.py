@@ -16,7 +16,7 @@ from rich.text import Text
 from torch import Tensor
 
 from mujoban_core.text import readable
-from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.run_directory import LOG, RunDirectory
 
 _SHOWN: Final = 5
 """Numbers that are shown, of those that are logged: the first."""
@@ -73,7 +73,7 @@ class TrainingLog:
         # Takes a quarter of a second to import, which nodes can do without.
         from torch.utils.tensorboard.writer import SummaryWriter
 
-        self._writer = SummaryWriter(str(run.path / "tensorboard"))
+        self._writer = SummaryWriter(str(run.path / LOG))
         self._file = (run.path / "metrics.jsonl").open("a", encoding="utf-8")
         self._console = console or Console(stderr=True)
         end = "" if total is None else f" of {total:,}"

@@ -48,13 +48,21 @@ def provenance() -> dict[str, Any]:
     spec = getattr(main, "__spec__", None)
     if spec is not None and spec.name:
         command = ["python", "-m", spec.name.removesuffix(".__main__"), *sys.argv[1:]]
-    try:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10
-        ).stdout.strip()
-    except OSError:
-        commit = ""
-    return {"command": " ".join(command), "commit": commit or None, "torch": torch.__version__}
+    return {"command": " ".join(command), "commit": _commit(), "torch": torch.__version__}
+
+
+def _commit() -> str | None:
+    """Return the commit of this code; None where it is in no repository, or lies in one of something else."""
+    file = Path(__file__)
+    found = ""
+    for command in (["ls-files", "--error-unmatch", file.name], ["rev-parse", "--verify", "HEAD"]):
+        try:
+            found = subprocess.run(
+                ["git", *command], cwd=file.parent, capture_output=True, text=True, timeout=10, check=True
+            ).stdout.strip()
+        except (OSError, subprocess.SubprocessError):
+            return None
+    return found
 
 
 def origin(path: str | Path | None) -> str | None:

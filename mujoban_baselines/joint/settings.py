@@ -9,7 +9,7 @@ from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_core.bodies import Body
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
-from mujoban_core.ranges import check_not_negative
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_planner.discrete_mpo import MPOSettings
 
 
@@ -54,6 +54,9 @@ class PlannerSettings:
     def __post_init__(self) -> None:
         """Reject what holds no decision, and an anchor that pushes away."""
         check_not_negative(self, "anchor")
+        check_positive(self, "rate")
+        check_shares(self, "discount")
+        check_counts(self, "critic_first", least=0)
         for name in ("batch", "replay", "n_step"):
             if getattr(self, name) < 1:
                 raise ValueError(f"planner: {name} {getattr(self, name)}: expected at least 1")

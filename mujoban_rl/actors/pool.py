@@ -156,6 +156,10 @@ class ActorPool(ABC):
         if whole and self.schedule != "first" and len(own["has"]) == self.count:
             self._resumed = state
 
+    def go_on(self, state: State) -> None:
+        """Play other episodes than those of the run so far, given what a light copy holds of its state."""
+        self._next_stream = state.values.get("pool", state.values)["next_stream"]
+
     def _start_all(self) -> None:
         resumed, self._resumed = self._resumed, None
         if resumed is None:

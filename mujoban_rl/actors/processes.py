@@ -20,7 +20,9 @@ from mujoban_rl.memory import keep_freed_memory
 
 _CONTEXT: Final = multiprocessing.get_context("spawn")
 _GRACE: Final = 1.0
-"""Seconds that a process has to end when it is asked to."""
+"""Seconds that a process has to end of which the other end of the pipe is gone."""
+_LAST: Final = 60
+"""Seconds that an actor plays on after a SIGTERM to all, in which the learner takes what it needs and is saved."""
 
 
 class _Seated:
@@ -61,12 +63,9 @@ class ProcessPool(ActorPool):
         """End the processes."""
         for process, pipe in self._workers.values():
             pipe.close()
-            process.terminate()
+            process.kill()  # it has nothing to put in order
         for process, _ in self._workers.values():
-            process.join(_GRACE)
-            if process.is_alive():
-                process.kill()
-                process.join()
+            process.join()
         self._workers = {}
 
     def _start(self, actor: int, stream: int) -> None:
@@ -133,6 +132,7 @@ class ProcessPool(ActorPool):
 def _serve(pipe: Connection, factory: ActorFactory, stream: int, threads: int) -> None:
     """Carry out orders until the pipe is closed."""
     children.end_with_parent()
+    children.outlast(_LAST)
     keep_freed_memory()
     torch.set_num_threads(threads)
     try:

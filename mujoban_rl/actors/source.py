@@ -67,6 +67,7 @@ class ActorSource(Source[BatchT], Generic[BatchT]):
         self.pool, self.store = pool, store
         self._ratio, self._first = steps_per_update, first_steps
         self._updates = 0
+        self._before: int | None = None  # updates of the run before a light copy of it, which versions count too
         self._seen: dict[str, list[float]] = {}
         self._staleness: list[int] = []
         self._since = time.monotonic(), 0  # when statistics were asked for last, steps since then
@@ -87,12 +88,14 @@ class ActorSource(Source[BatchT], Generic[BatchT]):
         self.store.add(experience)
         self.samples += experience.steps
         self._since = self._since[0], self._since[1] + experience.steps
-        self._staleness.append(self._updates - experience.version)
+        self._staleness.append((self._before or 0) + self._updates - experience.version)
         for name, values in experience.statistics.items():
             self._seen.setdefault(name, []).extend(np.ravel(values).tolist())
 
     def publish(self, weights: Mapping[str, Tensor], version: int) -> None:
         """Let actors play with these weights from their next sequence on."""
+        if self._before is None:
+            self._before = max(0, version - self._updates)
         self.pool.publish(weights, version)
 
     def statistics(self) -> Scalars:
@@ -122,6 +125,10 @@ class ActorSource(Source[BatchT], Generic[BatchT]):
         self._updates = state.part("own").values["updates"]
         self.pool.restore(state.part("pool"))
         self.store.restore(state.part("store"))
+
+    def go_on(self, state: State) -> None:
+        """Have the actors play other episodes than so far."""
+        self.pool.go_on(state.part("pool"))
 
     def close(self) -> None:
         """End the actors."""

@@ -15,7 +15,7 @@ from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAg
 from mujoban_baselines.critics import Critic
 from mujoban_baselines.impala import VTraceLearner, VTraceTrainingConfig
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
-from mujoban_baselines.networks import AgentOutput, BodySense, Recurrent, RecurrentAgent, dense
+from mujoban_baselines.networks import BodySense, RecurrentAgent, dense
 from mujoban_baselines.squares import SquaresTask
 from mujoban_baselines.task import LEVELS, MujobanTask, TaskConfig
 from mujoban_baselines.train import (
@@ -32,7 +32,6 @@ from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.vtrace import VTraceConfig
-from mujoban_rl.networks import Gaussian
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
@@ -104,8 +103,7 @@ def test_returns_end_with_an_episode_but_go_on_from_where_time_ran_out(ending, t
     batch |= {"reward": torch.ones(1, 4), "action": torch.zeros(1, 4, 2)}
     if ending is not None:
         batch[ending[0]][0, ending[1]] = True
-    online = AgentOutput(Gaussian(*torch.zeros(2, 1, 3, 2)), torch.zeros(1, 3, 256), Recurrent(*torch.zeros(2, 1, 8)))
-    loss = learner._critic_loss(batch, online, torch.tensor([[10.0, 20.0, 40.0, 80.0]]))
+    loss = learner._critic_loss(batch, torch.zeros(1, 3, 256), torch.tensor([[10.0, 20.0, 40.0, 80.0]]))
     assert loss.item() == pytest.approx(0.0 if target is None else 0.5 * target**2)
 
 
@@ -163,8 +161,10 @@ def test_levels_are_training_levels_in_the_shares_of_the_paper():
     outcomes = task.renew(np.arange(40))
     assert len({name for name in outcomes if name.startswith("solved/")}) >= 4
     task.close()
-    with pytest.raises(ValueError, match=r"episode_seconds 0\.0: expected at least 1"):
+    with pytest.raises(ValueError, match=r"episode_seconds is 0\.0: expected from 0\.05 to"):
         TaskConfig(episode_seconds=0.0)
+    with pytest.raises(ValueError, match="episode_seconds is inf"):
+        TaskConfig(episode_seconds=math.inf)
 
 
 def test_a_run_by_command_leaves_an_agent_and_a_curve(tmp_path, capsys):
@@ -225,7 +225,7 @@ def test_symmetric_critics_teach_the_torso_and_asymmetric_ones_do_not():
         agent: MonolithicAgent = learner.agent
         with torch.no_grad():
             value = torch.zeros(batch["reward"].shape)
-        loss = learner._critic_loss(batch, learner._over(agent, batch, SMALL.warm_up), value)
+        loss = learner._critic_loss(batch, learner._over(agent, batch, SMALL.warm_up).features, value)
         loss.backward()
         moved[critic] = any(p.grad is not None and bool(p.grad.any()) for p in agent.parameters())
     assert moved == {"symmetric": True, "asymmetric": False}

@@ -19,8 +19,8 @@ from mujoban_rl.actors import ActorError, ActorOptions, ActorSource
 from mujoban_rl.actors.local import LocalPool, ThreadPool
 from mujoban_rl.actors.pool import ActorDied
 from mujoban_rl.actors.processes import ProcessPool
-from mujoban_rl.engine import Budget, Cadence, State, Trainer
-from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.engine import CARRIED, Budget, Cadence, State, Trainer
+from mujoban_rl.run_directory import RunDirectory, copy_light
 
 STEPS = TICKS * ROWS
 
@@ -158,6 +158,25 @@ def test_a_resumed_run_in_parallel_plays_no_stream_twice(tmp_path):
     second = trainer(tmp_path, LocalPool(Walkers(), 2))
     assert second.progress.updates == 10 and second.run()
     assert [{stream for stream, _ in run.source.store.origins} for run in (first, second)] == [{0}, {1, 2}]
+
+
+@pytest.mark.parametrize("pool", [LocalPool, ThreadPool])
+def test_a_run_from_a_light_copy_plays_no_stream_twice(tmp_path, pool):
+    first = trainer(tmp_path / "here", pool(Walkers(), 2))
+    first.run(limit_updates=10)
+    copy_light(tmp_path / "here", tmp_path / "there", CARRIED)
+    second = trainer(tmp_path / "there", pool(Walkers(), 2))
+    assert second.run() and {stream for stream, _ in second.source.store.origins} == {2, 3}
+    lines = map(json.loads, (tmp_path / "there" / "metrics.jsonl").read_text().splitlines())
+    assert all(line["actors/staleness"] >= 0 for line in lines if "actors/staleness" in line)
+
+
+def test_a_signal_to_the_whole_group_leaves_the_learner_what_its_actors_play(tmp_path):
+    pool = ProcessPool(Walkers(), 1)
+    pool.publish({"weight": torch.zeros(1)}, 0)
+    os.kill(int(pool.collect().arrays["origin"][1]), signal.SIGTERM)
+    assert [int(pool.collect().arrays["origin"][0]) for _ in range(3)] == [0] * 3 and not pool.restarts
+    pool.close()
 
 
 def test_an_error_of_an_actor_ends_the_run_with_its_message():

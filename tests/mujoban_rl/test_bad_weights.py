@@ -1,7 +1,9 @@
 """Weights and records that nobody should load: each is one error that names the file, before memory is taken."""
 
 import json
+import os
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -105,3 +107,21 @@ def test_a_device_that_is_not_there_is_named(device):
 def test_weights_that_are_missing_are_named_and_not_their_record(tmp_path):
     with pytest.raises(WeightsError, match=r"none\.safetensors: no such weights file; expected \.safetensors"):
         w.read_record(tmp_path / "none.safetensors")
+
+
+def test_a_record_names_the_commit_of_this_code_and_of_no_other(tmp_path, monkeypatch):
+    environment = {"GIT_CONFIG_GLOBAL": os.devnull, "GIT_AUTHOR_NAME": "a", "GIT_AUTHOR_EMAIL": "a@b"}
+    environment |= {"GIT_COMMITTER_NAME": "a", "GIT_COMMITTER_EMAIL": "a@b", **os.environ}
+    file = tmp_path / "weights.py"
+    file.touch()
+
+    def git(*command):
+        return subprocess.run(["git", *command], cwd=tmp_path, env=environment, check=True, capture_output=True)
+
+    monkeypatch.setattr(w, "__file__", str(file))
+    git("init", "-q")
+    git("commit", "-q", "--allow-empty", "-m", "another project")
+    assert w.provenance()["commit"] is None
+    git("add", "weights.py")
+    git("commit", "-q", "-m", "this one")
+    assert w.provenance()["commit"] == git("rev-parse", "HEAD").stdout.decode().strip()

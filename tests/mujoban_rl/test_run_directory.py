@@ -65,7 +65,7 @@ class _Config:
 
 def test_a_run_from_before_an_option_came_goes_on_while_that_is_at_its_default(tmp_path):
     RunDirectory(tmp_path, {"steps": 3, "part": {"rate": 0.1}})
-    (tmp_path / "metrics.jsonl").touch()
+    (tmp_path / "metrics.jsonl").write_text("{}\n")
     RunDirectory(tmp_path, _Config(3, _Part(rate=0.1)))
     same = _Part(0.1)
     for other in (_Config(3, same, horizon=8.0), _Config(3, _Part(0.1, depth=3)), _Config(3), _Config(4, same)):
@@ -75,21 +75,29 @@ def test_a_run_from_before_an_option_came_goes_on_while_that_is_at_its_default(t
 
 def test_what_stands_beside_the_options_must_not_change_either(tmp_path):
     RunDirectory(tmp_path, {"steps": 3, "method": "MPO"})
-    (tmp_path / "metrics.jsonl").touch()
+    (tmp_path / "metrics.jsonl").write_text("{}\n")
     assert RunDirectory(tmp_path, _Config(3), beside={"method": "MPO"}).config["method"] == "MPO"
     with pytest.raises(RunError, match="method: 'MPO' there, 'PPO' now"):
         RunDirectory(tmp_path, _Config(3), beside={"method": "PPO"})
 
 
+def test_a_run_that_failed_before_its_first_line_leaves_the_directory_to_another(tmp_path):
+    RunDirectory(tmp_path, {"world": "refrence"})
+    (tmp_path / "metrics.jsonl").touch()
+    (tmp_path / "tensorboard").mkdir()
+    (tmp_path / "tensorboard" / "events").write_bytes(b"version")
+    assert RunDirectory(tmp_path, {"world": "reference"}).config == {"world": "reference"}
+
+
 def test_what_was_not_noted_yet_when_a_run_began_is_taken_at_its_word(tmp_path):
     RunDirectory(tmp_path, {"steps": 3})
-    (tmp_path / "metrics.jsonl").touch()
+    (tmp_path / "metrics.jsonl").write_text("{}\n")
     assert RunDirectory(tmp_path, _Config(3), beside={"method": "MPO"}).config["method"] == "MPO"
 
 
 def test_a_number_that_is_not_finite_is_text_in_a_configuration_so_that_weights_can_have_it_in_their_record(tmp_path):
     directory = RunDirectory(tmp_path, _Config(3, horizon=math.inf))
-    (tmp_path / "metrics.jsonl").touch()
+    (tmp_path / "metrics.jsonl").write_text("{}\n")
     net = Net()
     save_weights(tmp_path / "net.safetensors", net, {}, {"training": directory.config})
     assert json.loads(record_path(tmp_path / "net.safetensors").read_text())["training"]["horizon"] == "Infinity"
