@@ -176,17 +176,20 @@ class Processes:
         """Send a signal to a node."""
         self._children[name].send_signal(number)
 
-    def supervise(self) -> None:
+    def supervise(self, *, begun: bool = False) -> None:
         """Start again what has ended.
 
+        Args:
+            begun: Whether the graph has answered a tick, so that no node's input was bad when it started.
+
         Raises:
-            GraphError: If a node ended because its input is bad, or has ended too often.
+            GraphError: If a node could not start, or has ended too often.
         """
         for name, child in self._children.items():
             status = child.poll()
             if status is None:
                 continue
-            if status == USAGE_ERROR:
+            if status == USAGE_ERROR and not begun:
                 raise GraphError(f"the {name} node could not start")
             if self.restarts[name] == self._restart_limit:
                 times = self._restart_limit + 1

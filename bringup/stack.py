@@ -174,7 +174,7 @@ def top_camera_size(player: Player, filmed: bool) -> int:
 def _supervise(processes: Processes, monitor: MonitorNode) -> None:
     """Start again what has ended; a graph that cannot go on ends the run, and `spin` with it."""
     try:
-        processes.supervise()
+        processes.supervise(begun=monitor.ticks > 0)
     except GraphError as error:
         monitor.finished.set_exception(error)
 

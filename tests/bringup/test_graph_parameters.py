@@ -14,7 +14,9 @@ from bringup.graph_recorder import RecorderNode
 from bringup.parameters import graph_parameters, write_parameters
 from mujoban_controller import teacher_weights
 from mujoban_controller.node import ControllerNode
+from mujoban_estimator.estimator import StateEstimator
 from mujoban_planner.deliberation import Deliberation
+from mujoban_rl.weights import save_weights
 from mujoban_sim.node import PARAMETERS, SimulatorNode
 from mujoban_sokoban.episodes import Episodes
 
@@ -34,6 +36,25 @@ def test_weights_are_loaded_while_the_graph_runs_and_bad_ones_are_refused(play_g
     assert not refused.successful and "missing.safetensors" in refused.reason and estimator.module is module
     assert set_weights(fresh_weights.choices["estimator"].weights).successful
     assert estimator.module is not module
+    ticks = graph.simulator.ticks
+    graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
+
+
+def test_a_node_that_is_killed_after_other_weights_were_loaded_starts_anew(
+    play_graph, oracles, fresh_weights, tmp_path
+):
+    other = StateEstimator(channels=8, blocks=1)
+    save_weights(tmp_path / "other.safetensors", other, other.hyperparameters(), {})
+    stack = Stack(oracles.choices | {"estimator": fresh_weights.choices["estimator"]})
+    graph = play_graph(stack, time_limit=2000, memories=tmp_path)
+    graph.spin_until(lambda: graph.simulator.ticks >= 3)
+    weights = Parameter("weights", value=str(tmp_path / "other.safetensors")).to_parameter_msg()
+    request = SetParameters.Request(parameters=[weights])
+    assert graph.call(SetParameters, "/estimator/set_parameters", request).results[0].successful
+    ticks = graph.simulator.ticks
+    graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
+    graph.graph.stop("estimator")
+    graph.graph.start("estimator")
     ticks = graph.simulator.ticks
     graph.spin_until(lambda: graph.simulator.ticks > ticks + 3)
 
