@@ -17,6 +17,7 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.weights import WeightsError
 
+_SAME = ("propagation", "judge")
 _POOLED = "inject.linear.weight"
 """Weights whose inputs are two values for each channel."""
 
@@ -41,11 +42,13 @@ def start_from(network: LearnedPlanner, path: Path) -> None:
 
     Raises:
         WeightsError: If the file is damaged, or its planner has another architecture, or more channels or blocks, or is
-            a smaller recurrent one, whose gates cannot grow.
+            a smaller recurrent one, whose gates cannot grow, or differs in `propagation` or `judge`.
     """
     trained = load(path, compiled=False)
     ours, theirs = dict(network.named_parameters()), dict(trained.named_parameters())
     fits = isinstance(network, type(trained)) and all(k in ours and _holds(ours[k], v) for k, v in theirs.items())
+    # Without what it rests on, a rule or a head would say something else from the start.
+    fits = fits and all(trained.config[name] == network.config[name] for name in _SAME)
     if isinstance(network, RecurrentPlanner):
         fits = fits and all(ours[k].shape == v.shape for k, v in theirs.items())
     if not fits:

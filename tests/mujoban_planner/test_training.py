@@ -350,6 +350,8 @@ def test_a_larger_network_begins_with_what_a_smaller_one_says(tmp_path):
     start_from(large, path)
     for expected, given in zip(small(states), large(states), strict=True):
         assert torch.allclose(expected, given, atol=1e-4)
+    with pytest.raises(WeightsError, match=r"'judge': True.*'judge': False"):
+        start_from(ResidualPlanner(24, 3), path)
     repeating = ThinkingPlanner(16, 2, tied=1, judge=True)
     start_from(repeating, path)
     for expected, given in zip(small(states), repeating(states), strict=True):
