@@ -31,14 +31,20 @@ _SAMPLES: Final = {"controller": "ticks played", "planner": "samples"}
 """What a module is trained on, in whose millions a curve is drawn; the others learn from recorded ticks."""
 
 
-def difficulty(runs: Sequence[Run], file: Path) -> bool:
-    """Draw success against difficulty (paper Fig. 2); return False when nothing has been measured."""
+def difficulty(runs: Sequence[Run], file: Path, ahead: Run | None = None) -> bool:
+    """Draw success against difficulty (paper Fig. 2); return False when nothing has been measured.
+
+    Args:
+        runs: By the planner's policy alone.
+        file: The image.
+        ahead: One that searches ahead, which is drawn a little aside.
+    """
     reports = [(run, report) for run in runs if (report := load(run)) is not None]
     if not reports:
         return False
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
     for stale, label in (
-        (False, f"Mujoban, fully learned, {DEFAULT_WORLD} world"),
+        (False, f"all four modules learned, {DEFAULT_WORLD}\nworld, the planner's policy alone"),
         (True, "the same with other weights than ship now"),
     ):
         chosen = [(run, report) for run, report in reports if is_stale(report) == stale]
@@ -50,6 +56,14 @@ def difficulty(runs: Sequence[Run], file: Path) -> bool:
                 x, y, yerr=[low, high], capsize=3, label=label, marker="o", color="tab:blue",
                 linestyle="none" if stale else "-", markerfacecolor="white" if stale else "tab:blue",
             )  # fmt: skip
+    if ahead is not None and (report := load(ahead)) is not None:
+        bars = [[margin] for margin in margins(report)]
+        stale = is_stale(report)
+        axes.errorbar(
+            [ahead.difficulty + 0.1], [report["success_rate"]], yerr=bars, capsize=3, marker="D", color="tab:orange",
+            linestyle="none", markerfacecolor="white" if stale else "tab:orange",
+            label="the default, with the search ahead" + (", other weights" if stale else ""),
+        )  # fmt: skip
     for row in BASELINES:
         measured = [(d, report) for d in DIFFICULTIES if (report := load(row.run(d))) is not None]
         if measured:

@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from benchmarks.paper.baselines import AGAIN, BASELINES, MODULAR, RECORDING, points_of
 from benchmarks.paper.runs import DIFFICULTY, Run, distinct, is_stale, load
+from bringup.results import Failure
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.reports import count_uses
 
 STALE = " †"
 """Marks a result of other weights than those that ship now."""
 MISSING = "-"
+NOT_MEASURED: Final = "not measured"
 MODULAR_LEVELS = (
     "all difficulties; its own search, a teacher, rules that look around ([model cards](../models/))"
 )
 """What the modules that ship learned from, where the other rows have reward alone."""
+CAUSES: Final = {
+    Failure.WRONG_ESTIMATE:
+        "the decision that lost the level, or most of the last ones, rested on a wrong abstract state",
+    Failure.PLANNER_DEAD_END: "on a right estimate the planner made the level unsolvable, or ran in a loop",
+    Failure.CONTROLLER_TIME_OUT: "instructions ran into their time limit",
+    Failure.MISEXECUTION:
+        "a right instruction led to another state than the rules say, and that state is unsolvable",
+    Failure.LEVEL_LOST: "an agent without modules brought the level into a state that is unsolvable",
+    Failure.TIME_LIMIT: "none of these: the time ran out while the level could still be solved",
+}  # fmt: skip
+"""What each cause means, as `bringup.results.Failure` defines it."""
+_SAID: Final = {"vtrace": '"less than 30%" solved (section 3)'}
+"""What the paper's text says of the success of a row of Table 1, by the row's name."""
 
 
 def configurations(runs: Sequence[Run]) -> str:
@@ -28,7 +43,7 @@ def configurations(runs: Sequence[Run]) -> str:
 
 
 def failures(runs: Sequence[Run]) -> str:
-    """Return a table of how many episodes failed for which reason."""
+    """Return a table of how many episodes failed for which reason, and a line that says what the reasons mean."""
     reports = [load(run) for run in runs]
     reasons = sorted({reason for report in reports if report for reason in report["failures"]})
     rows = [
@@ -36,7 +51,13 @@ def failures(runs: Sequence[Run]) -> str:
         for run, report in zip(runs, reports, strict=True)
         if report
     ]
-    return _table(["configuration", *reasons], rows)
+    meant = "; ".join(f"*{reason}*, {CAUSES[Failure(reason)]}" for reason in reasons)
+    return _table(["configuration", *reasons], rows) + (f"\nCauses: {meant}.\n" if meant else "")
+
+
+def privileged(run: Run, report: dict[str, Any]) -> str:
+    """Return which roles were told the ground truth in an evaluation of a run: oracles, and teachers of bodies."""
+    return ", ".join(report.get("privileged", run.oracle)) or "none"
 
 
 def differences(one: Run, other: Run) -> str:
@@ -82,8 +103,9 @@ def baselines() -> str:
     title = "modular, as it ships, the planner's policy alone"
     rows = [[title, "o_cam, o_pr, o_pos", MODULAR_LEVELS, *_cost([]), MODULAR.paper, *rates]]
     for row in (*BASELINES, *(again for again in AGAIN if points_of(again))):
-        cost = _cost(points_of(row))
-        rows.append([row.title, row.sees, row.levels, *cost, row.paper, *_rates([row.run(d) for d in DIFFICULTIES])])
+        paper = "; ".join(filter(None, (row.paper, _SAID.get(row.name))))
+        rates = _rates([row.run(d) for d in DIFFICULTIES])
+        rows.append([row.title, row.sees, row.levels, *_cost(points_of(row)), paper, *rates])
     return _table(header, rows)
 
 
@@ -107,7 +129,7 @@ def _rates(runs: Sequence[Run]) -> list[str]:
     cells = []
     for run, report in reports:
         if report is None:
-            cells.append(MISSING)
+            cells.append(NOT_MEASURED)
             continue
         low, high = report["success_interval"]
         stale = STALE if is_stale(report, run) else ""
@@ -120,9 +142,9 @@ def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
     paper = [MISSING if run.paper_success is None else f"{100 * run.paper_success:.1f} %"]
     paper.append(MISSING if run.paper_reward is None else f"{run.paper_reward:.2f}")
     if report is None:
-        return [run.title, name, oracles, "0", "not measured", MISSING, paper[0], MISSING, paper[1]]
+        return [run.title, name, oracles, "0", NOT_MEASURED, MISSING, paper[0], MISSING, paper[1]]
     # A class of somebody's own that is told the truth counts as what it is.
-    oracles = ", ".join(report.get("privileged", run.oracle)) or "none"
+    oracles = privileged(run, report)
     returns = np.array([episode["return"] for episode in report["episodes"]])
     error = returns.std(ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else float("nan")
     low, high = report["success_interval"]

@@ -9,7 +9,7 @@ from benchmarks.paper import __main__ as results
 from benchmarks.paper import baselines, bodies, curves, figures, film, parts, runs, tables
 from bringup import train_all
 from bringup.command import Choice, Stack
-from bringup.results import EpisodeResult, report
+from bringup.results import EpisodeResult, Failure, report
 from mujoban_baselines.train import COMMANDS, PROG
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
@@ -40,8 +40,9 @@ def test_without_sources_the_page_names_the_commands_that_make_them(folder, caps
     assert "Rows are of the *reference* world" in page
     assert "python -m benchmarks.paper.runs --only film_strip" in page
     assert "python -m benchmarks.paper.curves --controller RUN" in page
-    assert page.count("not measured |") == 32, (
-        "two rows of Table 1, three of Table 2 and six beside, five of Figure 2, sixteen of Figure 5"
+    assert page.count("not measured |") == 88, (
+        "two rows of Table 1, three of Table 2 and six beside, six of Figure 2, sixteen of Figure 5, eleven agents at "
+        "five difficulties"
     )
     assert "no source yet" in capsys.readouterr().err
 
@@ -71,6 +72,15 @@ def test_the_page_has_our_numbers_beside_the_papers_and_marks_other_weights(fold
     assert f"| controller only{tables.STALE} | `controller` |" in page and (folder / "figure2.png").stat().st_size
     assert runs.is_current(runs.CONFIGURATIONS[0], 4) and not runs.is_current(runs.CONFIGURATIONS[0], 512)
     assert not runs.is_current(runs.CONFIGURATIONS[2], 4)
+
+
+def test_a_table_of_failures_says_what_each_of_its_causes_means(folder):
+    lost = [EpisodeResult(i, False, 3.0, 100, 9, 0, 0, failure) for i, failure in enumerate(Failure)]
+    write_report(report(lost, {}), runs.CONFIGURATIONS[0].file)
+    table = tables.failures(runs.CONFIGURATIONS)
+    assert all(f"*{failure}*, {tables.CAUSES[failure]}" in table for failure in Failure)
+    write(runs.CONFIGURATIONS[0], 4, 4, {})
+    assert "Causes" not in tables.failures(runs.CONFIGURATIONS)
 
 
 def test_levels_that_end_otherwise_through_the_graph_are_named(folder):
@@ -219,7 +229,7 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
     assert baselines.points_of(row)[-1] == {**cost, "solved": {"1": 1.0}, "return": {"1": 10.0}}
     write(row.run(1), 3, 4, {"agent": "a" * 64})
     page = results.rebuild(folder).read_text()
-    rates = "75.0 % (30.1 to 95.4) | - | - | - | -"
+    rates = "75.0 % (30.1 to 95.4)" + 4 * " | not measured"
     assert f"| MPO, asym. | o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 0.5 | 5 days, 256 actors | 4 | {rates} |" in page
     assert (folder / "baselines.png").stat().st_size and "--agent" in row.run(1).options()
     with pytest.raises(ValueError, match="nobody=x: expected NAME=RUN with a name among modular, mpo_hard"):
@@ -320,7 +330,8 @@ def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_pat
         assert options[options.index(f"--{role}") + 1] == str(weights)
     write(run, 2, 4, {})
     page = results.rebuild(folder).read_text()
-    cells = "1.50 M | 1.0 | 0.5 | 7 days, 200 to 1,000 actors a module | 4 | - | - | - | - | 50.0 % (15.0 to 85.0)"
+    cells = "1.50 M | 1.0 | 0.5 | 7 days, 200 to 1,000 actors a module | 4 |" + 4 * " not measured |"
+    cells += " 50.0 % (15.0 to 85.0)"
     assert f"| modular | o_cam, o_pr, o_pos | all difficulties, bottom-up ([how](../weights.md)) | {cells} |" in page
 
 
@@ -338,9 +349,12 @@ def words(axes):
 
 def test_figures_name_their_axes_their_bars_and_each_curve_in_words(folder, drawn):
     write(runs.CONFIGURATIONS[0], 3, 4, {role: digest(shipped_weights(role)) for role in ROLES})
-    assert figures.difficulty(runs.CONFIGURATIONS[:1], folder / "figure2.png")
+    write(runs.POLICY_ALONE[0], 2, 4, {role: digest(shipped_weights(role)) for role in ROLES})
+    assert figures.difficulty(runs.POLICY_ALONE[:1], folder / "figure2.png", runs.CONFIGURATIONS[0])
     (axes,) = drawn()
     assert axes.get_legend().get_title().get_text() == "bars: 95 % intervals (Wilson)"
+    _, alone, default = words(axes)
+    assert alone.endswith("the planner's policy alone") and default == "the default, with the search ahead"
     for name in ("controller", "controller_mpo", "controller_other_way"):
         points = [{"step": 1000 * i, "value": i / 3, "what": "instructions completed"} for i in range(4)]
         (runs.JSON / f"curve_{name}.jsonl").write_text("".join(json.dumps(point) + "\n" for point in points))
