@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from benchmarks.paper import bodies
+from benchmarks.paper import bodies, tables
 from benchmarks.paper.runs import ALL, ROOT, distinct, load
 from bringup import model_card
 from bringup.model_card import Place, Score
@@ -44,7 +44,7 @@ def card(path: Path) -> str:
 def _scores(digest: str | None) -> list[Score]:
     return [
         Score(
-            run.title, ", ".join(run.oracle) or "none", len(report["episodes"]), report["success_rate"],
+            run.title, tables.privileged(run, report), len(report["episodes"]), report["success_rate"],
             report["success_interval"],
         )
         for run in distinct((*bodies.RUNS, *ALL))

@@ -12,6 +12,8 @@ from typing import Any, Final, NamedTuple
 from mujoban_core.text import readable
 
 _WIDTH: Final = 112
+_SPENT: Final = ("steps", "updates", "samples", "env_steps", "seconds")
+"""What a record counts up to the end of its run."""
 _NAMED_TEACHERS: Final = ("scripted driver",)
 """What a record's `teacher` may be beside a digest."""
 
@@ -30,12 +32,27 @@ class Purpose:
     """How it learned, by what `_ways` reads in the record."""
     guide: str
     """Page in docs/."""
+    own: tuple[str, ...] = ("",)
+    """How the names of its metrics begin: trainers of two modules note those of both."""
+    terms: str = ""
+    """What names of metrics mean."""
 
     def how(self, record: Mapping[str, Any]) -> str:
         """Return how the weights of a record learned."""
         return "; then ".join(self.learned.get(way, f"by {way}") for way in _ways(record))
 
 
+_MAP_TERMS: Final = (
+    "A cell is *in view* in this frame, was *seen before* in an earlier one of the episode, or was *never seen*; "
+    "*seen* are the former two. The outer wall does not count. Accuracy is the share of cells that are right, "
+    "precision of what is named that is there, recall of what is there that is named. *Boxes all right* is the share "
+    "of frames in which no cell is wrong about boxes, *if seen* of those frames in which every box is in view or was "
+    "before. Frames are those that it takes in, one in `network.update_every` ticks."
+)
+_END_TERMS: Final = (
+    "Precision is the share of the instructions that it ended which were completed by then; *early by over 2 ticks* "
+    "the share that it ended more than 2 ticks before, or that never were."
+)
 _GRID_LIMITS: Final = "levels of up to 10 x 10 cells that look like the generator's; warehouses drawn by this renderer"
 
 PURPOSES: Final[dict[str, Purpose]] = {
@@ -47,6 +64,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "its attention starts from the camera's known geometry",
         {"": "supervised, by the ground truth in recorded bags"},
         "estimator",
+        ("agent_", "wall_", "target_", "box", "ticks"),
+        _MAP_TERMS,
     ),
     "ControlTermination": Purpose(
         "Control termination",
@@ -58,27 +77,34 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "where no heading is felt, filters of the heading and of the place in a cell that it reads from frames",
         {"": "supervised, by the rule of completion in recorded bags"},
         "estimator",
+        ("termination_", "ticks"),
+        _END_TERMS,
     ),
     "PrivilegedPolicy": Purpose(
         "Privileged teacher of the controller",
         "Drives a body to carry out instructions, as an oracle and as the teacher of a camera policy; learned from the "
-        "goal task's rewards alone (paper C.3).",
+        "goal task's shaped rewards, without demonstrations (paper C.3).",
         "The robot's pose and velocity, the boxes' positions, proprioception and the instruction: ground truth.",
         "Not for a robot that has only a camera. Made for the world that its record names.",
         "none",
-        {"teacher": "by reward alone, in the goal task"},
+        {
+            "teacher": "by reward, from no demonstration, in the goal task, whose reward is shaped and whose "
+            "instructions come from an optimal solver in a share of the episodes (`task.planned` below)"
+        },
         "controller",
     ),
     "ResidualPlanner": Purpose(
         "Planner",
         "Turns an estimate of the abstract state into the next instruction (paper C.2).",
         "The estimate of the abstract state and its own decisions of the episode. No camera, no ground truth.",
-        "Solves most levels, not all: what it loses ends nearly always in a state that only search proves dead. Boards "
-        "of 8 x 8 inner cells; more than four boxes were not trained on.",
-        "what was tried loses attraction; verdicts on pushes are weighed by a constant, and before a push called "
-        "deadly it looks at the board from every side; a fixed recursion by the rules of Sokoban tells what can be "
-        "reached and the way to a push; a tree search by these rules, guided by the network, looks ahead for a way to "
-        "the end (`--look-ahead 0`: none); a rule says where to look before each decision, for up to 30 instructions",
+        "Solves most levels, not all: an estimate that is wrong misleads it, and without the search ahead it also "
+        "pushes, on a right one, into states from which there is no way to the end. Boards of 8 x 8 inner cells; more "
+        "than four boxes were not trained on.",
+        "(1) what was tried loses attraction; (2) verdicts on pushes are weighed by a constant; (3) before a push that "
+        "may be deadly it looks at the board from every side; (4) a fixed recursion by the rules of Sokoban tells what "
+        "can be reached and the way to a push; (5) a tree search by these rules, guided by the network, looks ahead "
+        "for a way to the end (`--look-ahead 0`: none); (6) a rule says where to look before each decision, for up to "
+        "30 instructions an episode after the first look",
         {
             "imitation": "supervised, by an optimal solver, also on its own play",
             "expert-iteration": "by its own play and search, without a solver",
@@ -93,8 +119,8 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "Says where to look before pushing.",
         "The estimate of the abstract state and the cells that have been in view. No camera, no ground truth.",
         f"Trained in a grid model of what a camera sees behind walls. Made for {_GRID_LIMITS}.",
-        "it is asked before each decision, for up to 30 instructions; a fixed recursion tells what a turn at each "
-        "place would show, and the way there",
+        "it is asked before each decision, for up to 30 instructions an episode after the first look; a fixed "
+        "recursion tells what a turn at each place would show, and the way there",
         {"mpo, reward for cells that come into view": "by reward, for cells seen for the first time, by MPO"},
         "estimator",
     ),
@@ -173,7 +199,7 @@ def card(path: Path, file: str, place: Place, scores: Sequence[Score] = ()) -> s
         "The command, with the options of the commit above, which may have other names today; earlier weights of the "
         f"same name may stand for where it began:\n\n{_command(record)}",
         "## Scores",
-        *_scores(record, place, scores),
+        *_scores(record, purpose, place, scores),
         "## Configuration\n\n" + _table(("setting", "value"), _settings(record)),
     ]
     return "\n\n".join(parts) + "\n"
@@ -211,10 +237,15 @@ def _training(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     if record.get("bags"):
         bags = record["bags"]
         rows.append(("bags", str(bags if isinstance(bags, int) else len(bags))))
+    # The best of a run's evaluations is kept, and what it had taken by then is not noted.
+    whole = " of the whole run" if record.get("validation") else ""
     for name in ("method", "teacher", "steps", "updates", "samples", "env_steps", "seconds", "commit", "torch"):
         if record.get(name) is not None:
             value = record[name]
-            rows.append((name, f"{value:,}" if isinstance(value, int) else f"`{value}`"))
+            of = whole if name in _SPENT else ""
+            rows.append((name + of, f"{value:,}" if isinstance(value, int) else f"`{value}`"))
+    if whole and record.get("evaluation") is not None:
+        rows.append(("kept", f"what the run had at its evaluation {record['evaluation']}, counted from 0"))
     return rows
 
 
@@ -228,16 +259,19 @@ def _command(record: Mapping[str, Any]) -> str:
     return " \\\n".join("   " + line for line in lines)
 
 
-def _scores(record: Mapping[str, Any], place: Place, scores: Sequence[Score]) -> Iterator[str]:
+def _scores(record: Mapping[str, Any], purpose: Purpose, place: Place, scores: Sequence[Score]) -> Iterator[str]:
     if scores:
         yield f"As part of the stack, on {place.levels}:"
         yield _table(("configuration", "oracles", "levels", "solved", "95 % interval"), [_cells(s) for s in scores])
     kept = record.get("validation")
-    metrics = [(name, readable(value)) for name, value in _numbers(kept or record.get("metrics") or {})]
+    numbers = _numbers(kept or record.get("metrics") or {})
+    metrics = [(name, readable(value)) for name, value in numbers if name.startswith(purpose.own)]
     if metrics:
         which = "the evaluation for which it was kept" if kept else "its trainer's last evaluation"
         yield f"On its own, by {which}:"
         yield _table(("metric", "value"), metrics)
+        if purpose.terms:
+            yield purpose.terms
     if not scores and not metrics:
         yield "Not measured yet with these weights."
 

@@ -7,6 +7,7 @@ import shutil
 import pytest
 
 from benchmarks import model_cards
+from bringup import model_card
 from bringup.model_card import PURPOSES, CardError
 from mujoban_planner.explorer import Explorer
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
@@ -36,6 +37,23 @@ def test_a_card_says_in_which_world_its_weights_were_trained():
         record = json.loads(path.read_text())
         if path.stem != "planner":  # which learned from boards alone
             assert f"| world | `{record['world']}` |" in model_cards.card(path), path
+
+
+def test_a_card_has_the_metrics_of_its_own_module_and_says_what_is_of_the_whole_run():
+    cards = {path.stem: model_cards.card(path) for path in model_cards.records()}
+    assert "| boxes_all_right |" in cards["estimator"] and "| termination_precision |" not in cards["estimator"]
+    assert "| boxes_all_right |" not in cards["termination"] and "| termination_precision |" in cards["termination"]
+    assert "| samples of the whole run |" in cards["teacher_ball"], "the best of its evaluations was kept"
+    assert "| samples |" in cards["planner"]
+
+
+def test_a_record_that_notes_which_evaluation_was_kept_has_it_on_its_card(tmp_path):
+    (path,) = (path for path in model_cards.records() if path.stem == "teacher_ball")
+    record = json.loads(path.read_text()) | {"evaluation": 2}
+    noted = tmp_path / "teacher.json"
+    noted.write_text(json.dumps(record))
+    told = model_card.card(noted, "teacher.safetensors", model_card.Place("x", None, "levels"))
+    assert "| kept | what the run had at its evaluation 2, counted from 0 |" in told
 
 
 def test_the_readme_tells_of_each_module_how_it_learned_and_which_rules_stand_beside_it():
