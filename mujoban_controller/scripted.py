@@ -1,4 +1,4 @@
-"""The scripted teacher of the ball: it knows where everything is. A baseline, from which no shipped weight learns.
+"""The scripted driver of the ball: it knows where everything is. A baseline, from which no shipped weight learns.
 
 It differs from the oracle of `mujoban_sim.oracles` where a student needs it to. It bends back to its lane smoothly
 instead of turning round at a distance from it: a student that is not sure on which side of such a threshold it is
@@ -24,7 +24,7 @@ from mujoban_sim.goals import GoalKind
 
 @dataclass(frozen=True)
 class TeacherGains(SteeringGains):
-    """Gains of the scripted teacher; lengths in cells, speeds in cells per second, angles in radians.
+    """Gains of the scripted driver; lengths in cells, speeds in cells per second, angles in radians.
 
     It creeps on with `least_speed` until the termination signal comes.
     """
@@ -49,7 +49,7 @@ GAINS = TeacherGains()
 
 
 def scripted_driver(task: GoalTask) -> NDArray[np.float32]:
-    """Return the scripted teacher's torques (roll, steer) in a task, [B, 2]."""
+    """Return the scripted driver's torques (roll, steer) in a task, [B, 2]."""
     world, goals, g = task.world, task.world.goals, GAINS
     offsets = goal_offsets(world).astype(np.float64)
     to_target = offsets[:, :2]
