@@ -1,6 +1,6 @@
 """Train the controller: `python -m mujoban_controller.train --stage teacher|distil|mpo --run DIR`.
 
-1. `teacher`: a privileged policy learns the goal task from its rewards alone, by MPO or PPO (`--algorithm`).
+1. `teacher`: a privileged policy learns the goal task from its shaped rewards, by MPO or PPO (`--algorithm`).
 2. `distil --teacher WEIGHTS`: it is distilled into the camera policy, on the states that this one visits.
 3. `mpo --initial WEIGHTS`: the camera policy learns on by MPO with an asymmetric critic (paper C.3), that of its
    teacher by `--critic WEIGHTS`; without initial weights from scratch.
