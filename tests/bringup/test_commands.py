@@ -8,46 +8,25 @@ import subprocess
 import sys
 import time
 import tomllib
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 
 import imageio.v2 as imageio
 import pytest
+from commands import ALL_ORACLES, BUT_PLANNER, UNSOLVABLE, run
 
 from bringup import evaluate, record, run_stack, train
-from bringup.command import Stack, recorded_seed
-from bringup.options import EpisodeOptions
-from bringup.reporting import Reporting, played
-from bringup.results import EpisodeResult
+from bringup.command import recorded_seed
 from mujoban_controller import teacher_weights
-from mujoban_core.bodies import ANT
 from mujoban_core.files import digest
 from mujoban_core.plugins import shipped_weights
-from mujoban_core.program import exit_status
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.bags.training import episode_ticks, open_training_bag
 from mujoban_msgs_py.topics import GRAPH_TOPICS
-from mujoban_planner.deliberation import Deliberation
 from mujoban_sim import rendering
-from mujoban_sokoban.episodes import Episodes
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.generator import TRAIN_SEEDS
 from mujoban_sokoban.levels import Level, write_levels
-
-ALL_ORACLES = ["--oracle", "estimator,termination,planner,controller"]
-BUT_PLANNER = ["--oracle", "estimator,termination,controller"]
-UNSOLVABLE = """\
-#####
-#@  #
-#  $#
-#.  #
-#####
-"""
-
-
-def run(command, *arguments):
-    return exit_status("command", partial(command.main, [str(a) for a in arguments]))
 
 
 def test_run_stack_plays_records_films_and_reports(tmp_path, capfd):
@@ -72,128 +51,6 @@ def test_run_stack_shows_instruction_estimate_and_truth(capfd):
     assert run(run_stack, "--difficulty", 1, *ALL_ORACLES) == 0
     out = capfd.readouterr().out
     assert "instruction" in out and "estimate" in out and "ground truth" in out and "solved 1 of 1" in out
-
-
-def test_every_use_of_the_test_levels_is_kept_in_the_report(tmp_path):
-    path = tmp_path / "report.json"
-    for seed in (1000, 1001):
-        options = ("--difficulty", 1, "--episodes", 2, "--seed", seed, "--time-limit", 3)
-        assert run(evaluate, *options, *ALL_ORACLES, "--json", path) == 0
-    uses = json.loads(path.read_text())["test_uses"]
-    assert [use["seeds"] for use in uses] == [[1000, 1001], [1001, 1002]]
-    assert all(use["weights"]["planner"] == "oracle" and "commit" in use for use in uses)
-    assert [(use["played"]["difficulty"], use["played"]["time_limit"]) for use in uses] == [(1, 3), (1, 3)]
-
-
-def test_a_report_says_what_was_played(tmp_path):
-    path, levels = tmp_path / "report.json", tmp_path / "levels.txt"
-    write_levels(levels, [Level.from_text(UNSOLVABLE)])
-    game = {
-        "difficulty": 1, "level_file": None, "level_file_sha256": None, "seed": 5_000_007, "time_limit": 3,
-        "body": "ball", "world": "reference", "realtime": 0.0, "look_around": 7, "look_ahead": 0, "thinking": 0,
-    }  # fmt: skip
-    few = ["--episodes", 1, "--seed", 5_000_007, "--world", "reference", *ALL_ORACLES, "--json", path]
-    assert run(evaluate, *few, "--difficulty", 1, "--time-limit", 3, "--look-around", 7) == 0
-    assert json.loads(path.read_text())["played"] == game
-    filed = {"difficulty": None, "level_file": str(levels), "level_file_sha256": digest(levels)}
-    assert run(run_stack, "--headless", *few, "--levels", levels, "--time-limit", 3, "--realtime", 9) == 0
-    assert json.loads(path.read_text())["played"] == {**game, **filed, "look_around": 0, "realtime": 9.0}
-    searching = Stack(deliberation=Deliberation(look_ahead=400, certainty=0.8), body="ant")
-    told = played(searching, Episodes(1, 0), EpisodeOptions(body="ant"))
-    assert told["look_ahead"] == 400 and told["look_ahead_certainty"] == 0.8
-    assert told["look_around"] == ANT.look_ticks and told["time_limit"] == 9600
-
-
-def test_a_summary_on_the_terminal_names_lost_seeds_by_cause(capfd):
-    options = ("--difficulty", 1, "--episodes", 2, "--seed", 1000, "--time-limit", 3)
-    for command in (partial(run, evaluate), partial(run, run_stack, "--headless")):
-        assert command(*options, *ALL_ORACLES) == 0
-        captured = capfd.readouterr()
-        rate, cause, privileged, *busy = captured.out.splitlines()
-        assert all(line.startswith("simulator: repeated ticks: ") for line in busy)
-        assert rate.startswith("solved 0 of 2 (0.0 %, 95 % interval 0.0 to 65.8 %), mean return ")
-        assert cause == "lost by time limit: 2 (seeds 1000, 1001)"
-        assert privileged.startswith("privileged, told the ground truth: estimator: oracle")
-        assert "2 of 2 episodes ended" in captured.err
-
-
-def test_an_interrupted_evaluation_reports_what_it_has(tmp_path):
-    path = tmp_path / "report.json"
-    command = [sys.executable, "bringup/evaluate.py", "--difficulty", "1", "--episodes", "400", "--batch", "2"]
-    root = Path(run_stack.__file__).parents[1]
-    process = subprocess.Popen(
-        [*command, *ALL_ORACLES, "--time-limit", "20", "--json", str(path)], cwd=root, stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    process.stderr.readline()  # a tenth is played
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and err.strip().endswith("interrupted")
-    content = json.loads(path.read_text())
-    assert content["interrupted"] == 400 and 40 <= len(content["episodes"]) < 400
-    assert "interrupted: 400 episodes were asked for" in out
-
-
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        (["--json", "no/folder/report.json"], "no such folder"),
-        (["--json", "."], "is a folder"),
-        (["--video", "no/film.mp4"], "no such folder"),
-        (["--record", "."], "exists, expected a new folder"),
-        (["--record", "/proc/bag"], "expected a place that can be written to"),
-    ],
-)
-def test_places_for_output_are_checked_before_anything_is_played(capfd, monkeypatch, options, why):
-    monkeypatch.setattr("bringup.command.Stack.identities", lambda stack: pytest.fail("went on"))
-    assert run(run_stack, "--headless", *options) == 2
-    err = capfd.readouterr().err.strip()
-    assert f"error: {options[0]} {options[1]}: " in err and why in err and "\n" not in err
-
-
-def test_seeds_of_two_ranges_are_refused_before_anything_is_played(capfd, monkeypatch, tmp_path):
-    for name in ("bringup.evaluate.evaluate", "bringup.stack.play"):
-        monkeypatch.setattr(name, lambda *args, **options: pytest.fail("went on"))
-    across = ["--seed", 4_999_999, "--episodes", 2, *ALL_ORACLES]
-    for command in (partial(run, evaluate), partial(run, run_stack, "--headless")):
-        assert command(*across) == 2
-        (line,) = capfd.readouterr().err.splitlines()
-        assert "error: seeds 4999999 to 5000000: expected all in one range (test 0 to 4999999; " in line
-    levels = tmp_path / "levels.txt"
-    write_levels(levels, [Level.from_text(UNSOLVABLE)])
-    filed = Episodes(2, 4_999_999, level_file=levels)
-    Reporting(None, {}, filed, played(Stack(), filed, EpisodeOptions()))  # seeds say nothing of a file's levels
-
-
-def test_what_was_played_before_an_error_is_reported_and_that_test_levels_were_used(tmp_path, capfd):
-    result = EpisodeResult(1000, True, 11.0, 5, 1, 0, 0, None)
-    episodes = Episodes(4, 1000)
-    reporting = Reporting(tmp_path / "report.json", {}, episodes, played(Stack(), episodes, EpisodeOptions()))
-    with pytest.raises(OSError, match="disk"), reporting:
-        reporting.results = [result]
-        raise OSError("the disk is full")
-    content = json.loads((tmp_path / "report.json").read_text())
-    assert content["interrupted"] == 4 and content["test_uses"][0]["seeds"] == [1000, 1000]
-    assert capfd.readouterr().out.count("solved 1 of 1") == 1
-
-
-def test_of_a_file_only_the_levels_that_are_played_are_looked_through(tmp_path, monkeypatch, capsys):
-    levels = tmp_path / "levels.txt"
-    write_levels(levels, [generate_level(1, 1000), Level.from_text(UNSOLVABLE), generate_level(1, 1001)])
-    EpisodeOptions(levels=levels, episodes=1).make(3)
-    assert not capsys.readouterr().err
-    EpisodeOptions(levels=levels, episodes=2).make(0)
-    assert "level 1 of" in capsys.readouterr().err
-
-
-def test_a_report_goes_through_a_device_and_never_replaces_it(tmp_path, capfd):
-    few = ["--difficulty", 1, "--episodes", 1, "--time-limit", 3, *ALL_ORACLES]
-    null = tmp_path / "null"
-    null.symlink_to("/dev/null")
-    assert run(evaluate, *few, "--json", null) == 0 and run(evaluate, *few, "--json", "/dev/null") == 0
-    assert null.is_symlink() and Path("/dev/null").is_char_device()
-    assert run(evaluate, *few, "--json", "/dev/full") == 2
-    assert capfd.readouterr().err.splitlines()[-1] == "command: error: /dev/full: No space left on device"
 
 
 @pytest.mark.parametrize(
