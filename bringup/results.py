@@ -7,27 +7,38 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
 
 from mujoban_core.plugins import PRIVILEGED, privileged_roles
 from mujoban_core.stats import wilson_interval
 
 
 class Failure(StrEnum):
-    """Why an episode was not solved; `bringup.failure` tells which."""
+    """Why an episode was not solved, and what that means; `bringup.failure` tells which."""
 
-    WRONG_ESTIMATE = "wrong estimate"
-    """The decision that lost the level, or most of the last ones, rested on a wrong abstract state."""
-    PLANNER_DEAD_END = "planner dead end"
-    """On a right estimate the planner made the level unsolvable, or ran in a loop."""
-    CONTROLLER_TIME_OUT = "controller time-out"
-    """Instructions ran into their time limit."""
-    MISEXECUTION = "misexecution"
-    """A right instruction led to another state than the rules say, and that state is unsolvable."""
-    LEVEL_LOST = "level lost"
-    """An agent without modules brought the level into a state that is unsolvable."""
-    TIME_LIMIT = "time limit"
-    """None of these: the episode's time ran out while the level could still be solved."""
+    meaning: str
+
+    def __new__(cls, value: str, meaning: str) -> Self:
+        """Return a cause by its name."""
+        cause = str.__new__(cls, value)
+        cause._value_, cause.meaning = value, meaning
+        return cause
+
+    WRONG_ESTIMATE = (
+        "wrong estimate",
+        "the decision that lost the level, or most of the last ones, rested on a wrong abstract state",
+    )
+    PLANNER_DEAD_END = (
+        "planner dead end",
+        "on a right estimate the planner made the level unsolvable, or ran in a loop",
+    )
+    CONTROLLER_TIME_OUT = "controller time-out", "instructions ran into their time limit"
+    MISEXECUTION = (
+        "misexecution",
+        "a right instruction led to another state than the rules say, and that state is unsolvable",
+    )
+    LEVEL_LOST = "level lost", "an agent without modules brought the level into a state that is unsolvable"
+    TIME_LIMIT = "time limit", "none of these: the time ran out while the level could still be solved"
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,17 +21,6 @@ MODULAR_LEVELS = (
     "all difficulties; its own search, a teacher, rules that look around ([model cards](../models/))"
 )
 """What the modules that ship learned from, where the other rows have reward alone."""
-CAUSES: Final = {
-    Failure.WRONG_ESTIMATE:
-        "the decision that lost the level, or most of the last ones, rested on a wrong abstract state",
-    Failure.PLANNER_DEAD_END: "on a right estimate the planner made the level unsolvable, or ran in a loop",
-    Failure.CONTROLLER_TIME_OUT: "instructions ran into their time limit",
-    Failure.MISEXECUTION:
-        "a right instruction led to another state than the rules say, and that state is unsolvable",
-    Failure.LEVEL_LOST: "an agent without modules brought the level into a state that is unsolvable",
-    Failure.TIME_LIMIT: "none of these: the time ran out while the level could still be solved",
-}  # fmt: skip
-"""What each cause means, as `bringup.results.Failure` defines it."""
 _SAID: Final = {"vtrace": '"less than 30%" solved (section 3)'}
 """What the paper's text says of the success of a row of Table 1, by the row's name."""
 
@@ -51,7 +40,7 @@ def failures(runs: Sequence[Run]) -> str:
         for run, report in zip(runs, reports, strict=True)
         if report
     ]
-    meant = "; ".join(f"*{reason}*, {CAUSES[Failure(reason)]}" for reason in reasons)
+    meant = "; ".join(f"*{reason}*, {Failure(reason).meaning}" for reason in reasons)
     return _table(["configuration", *reasons], rows) + (f"\nCauses: {meant}.\n" if meant else "")
 
 
