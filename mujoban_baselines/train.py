@@ -202,7 +202,7 @@ def make_trainer(
     directory = RunDirectory(run, config, beside={"method": method, "origins": start})
     record = {
         **provenance(),
-        "training": {name: value for name, value in directory.config.items() if name != "origins"},
+        "training": {**directory.options, "method": method},
         "start": start,
         **config.data,
         **(data or {}),

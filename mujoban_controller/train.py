@@ -289,7 +289,7 @@ def make_trainer(options: Options) -> Trainer[Any]:
     learner, source = _Parts(options).make()
     record = {
         **provenance(),
-        "training": {name: value for name, value in directory.config.items() if name not in beside},
+        "training": directory.options,
         **origins,
         "data": _data(options),
         "world": config.task.world,

@@ -48,6 +48,10 @@ class RunDirectory:
 
     Checkpoints are `checkpoint-<step>.safetensors` with a JSON part beside that is written last, so a file pair
     is whole or is ignored. The last `keep` survive.
+
+    Attributes:
+        options: The configuration as `config.json` has it.
+        config: The same with what stands beside it.
     """
 
     def __init__(
@@ -71,12 +75,13 @@ class RunDirectory:
         """
         self.path = Path(path)
         self.keep = keep
-        self.config = _as_json(config) | _as_json(beside or {})
+        self.options, fixed = _as_json(config), _as_json(beside or {})
+        self.config = self.options | fixed
         self.path.mkdir(parents=True, exist_ok=True)
         file = self.path / _CONFIG
         if file.exists() and any(other != file and _holds_something(other) for other in self.path.iterdir()):
             # An option that there was not yet when the run began is as if it had been left alone.
-            stored = _overlaid(_defaults(config), _as_json(beside or {}) | _read_config(file))
+            stored = _overlaid(_defaults(config), fixed | _read_config(file))
             changed = sorted(k for k in stored.keys() | self.config.keys() if stored.get(k) != self.config.get(k))
             if changed:
                 pairs = ", ".join(f"{k}: {stored.get(k)!r} there, {self.config.get(k)!r} now" for k in changed)

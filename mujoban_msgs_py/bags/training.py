@@ -94,9 +94,8 @@ def require_training_seeds(bag: Bag) -> None:
     Raises:
         BagError: If it does, or is damaged.
     """
-    for value in bag.read([topics.TRUE_EPISODE.name]):
-        _require_training_level(bag, value.value)
-        return
+    if (episode := _first_episode(bag)) is not None:
+        _require_training_level(bag, episode)
 
 
 def require_untested(bag: Bag) -> None:
@@ -105,13 +104,16 @@ def require_untested(bag: Bag) -> None:
     Raises:
         BagError: If it does, or is damaged.
     """
-    for value in bag.read([topics.TRUE_EPISODE.name]):
-        if value.value.seed in TEST_SEEDS and value.value.difficulty:
-            raise BagError(
-                f"{bag.path} holds an episode with seed {value.value.seed}, one for tests, by which nothing is chosen: "
-                "expected validation or training levels"
-            )
-        return
+    episode = _first_episode(bag)
+    if episode is not None and episode.difficulty and episode.seed in TEST_SEEDS:
+        raise BagError(
+            f"{bag.path} holds an episode with seed {episode.seed}, one for tests, by which nothing is chosen: "
+            "expected validation or training levels"
+        )
+
+
+def _first_episode(bag: Bag) -> EpisodeTruthReading | None:
+    return next((value.value for value in bag.read([topics.TRUE_EPISODE.name])), None)
 
 
 def require_about(bag: Bag, expected: Mapping[str, str], source: str) -> None:

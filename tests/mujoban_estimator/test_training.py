@@ -32,6 +32,8 @@ from mujoban_rl.run_directory import RunError
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import WeightsError
 
+SMALL = EstimatorConfig(channels=8, blocks=1), TerminationConfig(channels=8, blocks=1)
+
 
 @pytest.mark.parametrize(
     ("option", "message"), [("--threads", "0 threads: expected"), ("--evaluate-every", "evaluate every 0 samples")]
@@ -94,8 +96,7 @@ def test_what_is_recorded_can_be_learned_from_and_learning_goes_on_where_it_stop
 
 @pytest.fixture
 def make(bags):
-    small = EstimatorConfig(channels=8, blocks=1), TerminationConfig(channels=8, blocks=1)
-    config = TrainConfig(LearnerConfig(*small, window_frames=8), streams=2, length=4, steps=20, warm_up=0.0)
+    config = TrainConfig(LearnerConfig(*SMALL, window_frames=8), streams=2, length=4, steps=20, warm_up=0.0)
 
     def make(path, workers=0, bags=bags):
         return make_trainer(Options((bags,), path, config=config, workers=workers))
@@ -155,8 +156,7 @@ def test_damaged_parts_of_validation_bags_are_left_out_too_where_that_is_asked_f
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 0xFF
     file.write_bytes(content)
-    small = EstimatorConfig(channels=8, blocks=1), TerminationConfig(channels=8, blocks=1)
-    config = TrainConfig(LearnerConfig(*small, window_frames=8), streams=1, length=4, steps=1)
+    config = TrainConfig(LearnerConfig(*SMALL, window_frames=8), streams=1, length=4, steps=1)
     options = Options((bags,), tmp_path / "run", (damaged,), config=config, workers=0)
     with pytest.raises(BagError, match="damaged"):
         make_trainer(options)
@@ -184,8 +184,7 @@ def test_nothing_is_chosen_by_test_levels_and_judging_on_them_is_noted(make, bag
 
 def test_a_run_that_began_with_weights_goes_on_with_the_same_named_ones_alone(make, bags, tmp_path):
     make(tmp_path / "made").save()
-    small = EstimatorConfig(channels=8, blocks=1), TerminationConfig(channels=8, blocks=1)
-    config = TrainConfig(LearnerConfig(*small, window_frames=8), streams=1, length=4, steps=20)
+    config = TrainConfig(LearnerConfig(*SMALL, window_frames=8), streams=1, length=4, steps=20)
     options = Options((bags,), tmp_path / "run", start=tmp_path / "made" / "weights", config=config, workers=0)
     make_trainer(options).save()
     make_trainer(options)
