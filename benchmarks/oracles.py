@@ -51,7 +51,8 @@ def run(options: Options | None = None) -> dict[str, Any]:
     options = options or Options()
     body = options.physics.body
     stack = Stack({role: oracle(role, body) for role in ROLES}, body=body)
-    noted = noted_use(options.seed, options.levels, stack.identities(), {"program": PROG, **asdict(options)})
+    seeds = range(options.seed, options.seed + options.levels)
+    noted = noted_use(seeds, stack.identities(), {"program": PROG, **asdict(options)})
     episodes = list(Episodes(options.levels, options.seed, difficulty=options.difficulty))
     batch = min(options.batch, len(episodes))
     world = World(batch, body=body, world=options.physics.world, threads=options.threads)

@@ -93,7 +93,7 @@ class Reporting:
             from mujoban_rl.sealed_levels import noted_use
 
             seeds = [entry["seed"] for entry in content["episodes"]]
-            content |= noted_use(min(seeds), max(seeds) - min(seeds) + 1, self._weights, content["played"])
+            content |= noted_use(seeds, self._weights, content["played"])
         print(*summary(content), sep="\n", flush=True)
         if self._path is not None:
             write_report(content, self._path)

@@ -106,7 +106,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
         "seed": options.seed,
     }  # fmt: skip
     how = {name: getattr(options, name) for name in ("driver", "instructions", "difficulty", "body", "world")}
-    told |= noted_use(options.seed, options.episodes, weights, {"program": PROG, **how})
+    seeds = range(options.seed, options.seed + options.episodes)
+    told |= noted_use(seeds, weights, {"program": PROG, **how})
     give_report({**report, **told}, options.json)
     return 0
 

@@ -144,7 +144,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
     result = evaluate(planner, levels, options)
     if options.levels is None:
         how = {name: result[name] for name in ("difficulty", "thinking", "caution", "look_ahead")}
-        result |= noted_use(options.seed, options.episodes, result["weights"], {"program": PROG, **how})
+        seeds = range(options.seed, options.seed + options.episodes)
+        result |= noted_use(seeds, result["weights"], {"program": PROG, **how})
     low, high = result["success_interval"]
     print(f"success rate          {result['success_rate']:.4f}  [{low:.4f}, {high:.4f}]  n = {result['n']}")
     if "moves_over_optimal" in result:

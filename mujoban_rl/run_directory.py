@@ -21,8 +21,6 @@ from mujoban_rl.weights import check_finite
 
 _ANOTHER = "choose another directory"
 _CONFIG: Final = "config.json"
-LOG: Final = "tensorboard"
-"""Folder of TensorBoard's events."""
 _SYSTEM_ERROR: Final = re.compile(r"\(os error (\d+)\)")
 
 
@@ -60,7 +58,7 @@ class RunDirectory:
         """Create the directory, or reopen it when its configuration is the same.
 
         One in which nothing has been done yet takes a new configuration: a start that failed, for instance at a file
-        that is missing, does not stand in the way of the next, though it may have opened its log.
+        that is missing, does not stand in the way of the next.
 
         Args:
             path: Directory; an existing one is resumed.
@@ -79,7 +77,7 @@ class RunDirectory:
         self.config = self.options | fixed
         self.path.mkdir(parents=True, exist_ok=True)
         file = self.path / _CONFIG
-        if file.exists() and any(other != file and _holds_something(other) for other in self.path.iterdir()):
+        if file.exists() and any(other != file for other in self.path.iterdir()):
             # An option that there was not yet when the run began is as if it had been left alone.
             stored = _overlaid(_defaults(config), fixed | _read_config(file))
             changed = sorted(k for k in stored.keys() | self.config.keys() if stored.get(k) != self.config.get(k))
@@ -222,11 +220,6 @@ def copy_light(run: Path, out: Path, parts: Collection[str]) -> Path | None:
     light = {"step": content["step"], "light": True, "extra": kept, "digest": digest(target)}
     write_atomically(target.with_suffix(".json"), json.dumps(light).encode())
     return target
-
-
-def _holds_something(entry: Path) -> bool:
-    """Return whether an entry of a run's directory tells that it has done anything: a log without a line does not."""
-    return entry.name != LOG and (entry.is_dir() or entry.stat().st_size > 0)
 
 
 def _path_to(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -10,24 +10,24 @@ from mujoban_rl.weights import provenance
 from mujoban_sokoban.generator import seed_range
 
 
-def noted_use(first: int, count: int, weights: Mapping[str, str], played: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entry `test_uses` of a report on `count` levels with the seeds from `first` on; none of others.
+def noted_use(seeds: Collection[int], weights: Mapping[str, str], played: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entry `test_uses` of a report on generated levels with these seeds; none of others.
 
     It lists what was evaluated, on which levels, by which code, how and when; `mujoban_core.reports.count_uses` counts.
 
     Args:
-        first: Seed of the first level.
-        count: Number of levels.
+        seeds: Of the levels, at least one; of those between the first and the last it may lack some.
         weights: What identifies each module.
         played: How.
 
     Raises:
         ValueError: If the seeds do not all lie in one range.
     """
-    if seed_range(first, count) != "test":
+    first, last = min(seeds), max(seeds)
+    if seed_range(first, last - first + 1) != "test":
         return {}
     use = {
-        "commit": provenance()["commit"], "weights": dict(weights), "seeds": [first, first + count - 1],
+        "commit": provenance()["commit"], "weights": dict(weights), "seeds": [first, last],
         "played": dict(played), "when": datetime.now(UTC).isoformat(timespec="seconds"),
     }  # fmt: skip
     return {"test_uses": [use]}

@@ -6,9 +6,11 @@ import json
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from datetime import timedelta
+from functools import cached_property
 from types import TracebackType
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self, TextIO
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -16,7 +18,10 @@ from rich.text import Text
 from torch import Tensor
 
 from mujoban_core.text import readable
-from mujoban_rl.run_directory import LOG, RunDirectory
+from mujoban_rl.run_directory import RunDirectory
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard.writer import SummaryWriter
 
 _SHOWN: Final = 5
 """Numbers that are shown, of those that are logged: the first."""
@@ -60,7 +65,7 @@ class TrainingLog:
         console: Console | None = None,
         line_seconds: float = LINE_SECONDS,
     ) -> None:
-        """Append to the run's files.
+        """Show progress; the run's files are made, or appended to, with the first line.
 
         Args:
             run: The run's directory.
@@ -70,11 +75,7 @@ class TrainingLog:
             console: Where progress is shown; by default stderr.
             line_seconds: Between two lines of progress, where there is no terminal.
         """
-        # Takes a quarter of a second to import, which nodes can do without.
-        from torch.utils.tensorboard.writer import SummaryWriter
-
-        self._writer = SummaryWriter(str(run.path / LOG))
-        self._file = (run.path / "metrics.jsonl").open("a", encoding="utf-8")
+        self._run, self._files = run.path, ExitStack()
         self._console = console or Console(stderr=True)
         end = "" if total is None else f" of {total:,}"
         self._count = f"{{task.completed:,.0f}}{end} {unit}s"
@@ -97,11 +98,12 @@ class TrainingLog:
             line: What is printed of them in any case, if something.
         """
         numbers = {k: float(v) for k, v in values.items()}
+        writer, file = self._opened
         for name, value in numbers.items():
-            self._writer.add_scalar(name, value, step)
+            writer.add_scalar(name, value, step)
         finite = {k: v if math.isfinite(v) else None for k, v in numbers.items()}
-        self._file.write(json.dumps({"step": step, "time": round(time.time(), 1), **finite}) + "\n")
-        self._file.flush()
+        file.write(json.dumps({"step": step, "time": round(time.time(), 1), **finite}) + "\n")
+        file.flush()
         shown = list(numbers.items())[:_SHOWN]
         self._bar.numbers = [f"{name.rsplit('/')[-1]} {readable(value)}" for name, value in shown]
         self._unsaid = True
@@ -109,6 +111,14 @@ class TrainingLog:
             self._print(line)
         elif time.monotonic() - self._printed >= self._line_seconds:
             self._print_progress()
+
+    @cached_property
+    def _opened(self) -> tuple[SummaryWriter, TextIO]:
+        # Takes a quarter of a second to import, which nodes can do without.
+        from torch.utils.tensorboard.writer import SummaryWriter
+
+        writer = self._files.enter_context(SummaryWriter(str(self._run / "tensorboard")))
+        return writer, self._files.enter_context((self._run / "metrics.jsonl").open("a", encoding="utf-8"))
 
     def _print_progress(self) -> None:
         """Print a line of progress, unless a terminal shows the bar."""
@@ -128,8 +138,7 @@ class TrainingLog:
             self._print_progress()
         if self._console.is_interactive:
             self._bar.stop()
-        self._writer.close()
-        self._file.close()
+        self._files.close()
 
     def __enter__(self) -> Self:
         """Return the log itself."""

@@ -106,7 +106,7 @@ def record(film: Film) -> None:
         "torque": [[float(str(value)) for value in values] for values in torque[first]],
     }
     how = {name: content[name] for name in ("difficulty", "body", "world")}
-    content |= noted_use(seed, len(episodes), content["weights"], {"program": film.rerun, **how})
+    content |= noted_use(range(seed, seed + len(episodes)), content["weights"], {"program": film.rerun, **how})
     write_report(content, film.source, indent=None)
     print(f"{film.name}: solved the level of seed {seed + first} in {len(torque[first])} steps", flush=True)
 

@@ -16,6 +16,7 @@ from mujoban_core.stats import wilson_interval
 from mujoban_rl import run_directory
 from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.run_directory import RunDirectory, RunError, copy_light
+from mujoban_rl.training_log import TrainingLog
 from mujoban_rl.weights import WeightsError, load_weights, record_path, save_weights
 
 
@@ -82,10 +83,8 @@ def test_what_stands_beside_the_options_must_not_change_either(tmp_path):
 
 
 def test_a_run_that_failed_before_its_first_line_leaves_the_directory_to_another(tmp_path):
-    RunDirectory(tmp_path, {"world": "refrence"})
-    (tmp_path / "metrics.jsonl").touch()
-    (tmp_path / "tensorboard").mkdir()
-    (tmp_path / "tensorboard" / "events").write_bytes(b"version")
+    with TrainingLog(RunDirectory(tmp_path, {"world": "refrence"})):
+        pass
     assert RunDirectory(tmp_path, {"world": "reference"}).config == {"world": "reference"}
 
 
