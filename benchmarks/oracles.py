@@ -20,6 +20,7 @@ from bringup.options import WorldOptions
 from bringup.progress import EpisodesBar
 from bringup.rollout import ticks
 from mujoban_core.plugins import ROLES
+from mujoban_core.ranges import check_counts
 from mujoban_core.stats import wilson_interval
 from mujoban_rl.sealed_levels import noted_use
 from mujoban_sim.goals import GoalKind
@@ -40,6 +41,10 @@ class Options:
     batch: int = 64
     threads: int = 2
     physics: Annotated[WorldOptions, arg(name="")] = field(default_factory=WorldOptions)
+
+    def __post_init__(self) -> None:
+        """Reject fewer levels, games at once or threads than one."""
+        check_counts(self, "levels", "batch", "threads")
 
 
 def run(options: Options | None = None) -> dict[str, Any]:
