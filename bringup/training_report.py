@@ -26,6 +26,8 @@ _RATES: Final = (
     "success_rate", "agent_accuracy", "boxes_all_right_if_seen", "termination_precision", "termination_recall",
 )  # fmt: skip
 """Scores that are drawn, of all that start so; the table has steps as well."""
+_COLUMNS: Final = 4
+"""Panels side by side in the figure of curves."""
 _RECORDED: Final = re.compile(r"^(\d+) ticks of ", re.MULTILINE)
 """What `bringup.record` says at its end."""
 
@@ -81,13 +83,18 @@ def draw_curves(run: Path, names: list[str], path: Path) -> bool:
     found = {name: curves for name in names if (curves := _rates(run / name))}
     if not found:
         return False
-    figure, axes = plt.subplots(1, len(found), figsize=(4.2 * len(found), 3.4), squeeze=False)
-    for axis, (name, curves) in zip(axes[0], found.items(), strict=True):
+    columns = min(len(found), _COLUMNS)
+    rows = -(-len(found) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(3.6 * columns, 3.0 * rows), squeeze=False)
+    for axis in axes.flat[len(found) :]:
+        axis.remove()
+    for axis, (name, curves) in zip(axes.flat, found.items(), strict=False):
         for label, points in curves.items():
             axis.plot(*zip(*points, strict=True), label=label.replace("_", " ").replace("/", ", "), marker=".")
         axis.set(title=name.replace("_", " "), xlabel="CPU seconds of all processes", ylim=(0.0, 1.02))
-        axis.legend(fontsize=7)
-    axes[0][0].set_ylabel("rate on validation levels")
+        axis.legend(fontsize=8)
+    for row in axes:
+        row[0].set_ylabel("rate on validation levels")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
