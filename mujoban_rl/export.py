@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import logging
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -51,14 +52,18 @@ def export_graph(
     if find_spec("onnxscript") is None:
         raise ModuleNotFoundError("exporting needs onnxscript, which is part of mujoban[dev]: pip install onnxscript")
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    program = torch.onnx.export(
-        _Step(module, function).eval(),
-        tuple(inputs),
-        dynamo=True,
-        input_names=signature.inputs,
-        output_names=signature.outputs,
-        verbose=False,
-    )
+    with warnings.catch_warnings():
+        # Of PyTorch about its own parts.
+        warnings.filterwarnings("ignore", "`isinstance\\(treespec, LeafSpec\\)` is deprecated")
+        warnings.filterwarnings("ignore", "The tensor attributes .* were assigned during export")
+        program = torch.onnx.export(
+            _Step(module, function).eval(),
+            tuple(inputs),
+            dynamo=True,
+            input_names=signature.inputs,
+            output_names=signature.outputs,
+            verbose=False,
+        )
     assert program is not None
     model = program.model
     _strip(model.graph.all_nodes())

@@ -10,13 +10,14 @@ from mujoban_core.program import exit_status
 from mujoban_rl.weights import WeightsError
 
 
-def test_a_module_is_told_by_its_record_and_its_graph_lies_beside(tmp_path, capsys):
+def test_a_module_is_told_by_its_record_and_its_graph_lies_beside(tmp_path, capsys, recwarn):
     weights = tmp_path / "controller.safetensors"
     for suffix in (".safetensors", ".json"):
         shutil.copy(mujoban_controller.SHIPPED.with_suffix(suffix), weights.with_suffix(suffix))
     assert main([str(weights)]) == 0
     assert capsys.readouterr().out.startswith(f"{weights.with_suffix('.onnx')}: 5.")
     assert mujoban_controller.load(weights).compiled is not None
+    assert not [str(warning.message) for warning in recwarn]
 
 
 def test_weights_that_have_no_graph_are_named():
