@@ -62,6 +62,9 @@ class PushMPOConfig(PushRunConfig):
     n_step: int = 5
     discount: float = 0.97
     """Per push."""
+    time_outs_lost: bool = False
+    """Whether a level that time cuts short counts as lost, though how many moves are left is not seen; it is left out
+    otherwise."""
     q_weight: float = 5.0
     """Weight of the critic's loss."""
     average: float = 0.99
@@ -121,8 +124,9 @@ class PushMPOLearner(Learner[Window]):
         """Take a step of policy, critic and dual variables."""
         config = self.config
         self._schedule.follow(progress)
-        # How many moves are left is not seen: a step that time cuts short does not count.
         reward, terminated, truncated = (batch[name][:, :-1] for name in ("reward", "terminated", "truncated"))
+        if config.time_outs_lost:
+            terminated, truncated = terminated | truncated, torch.zeros_like(truncated)
         returns = windowed_returns(reward, terminated, truncated, config.discount)
         rows = torch.arange(len(reward))
         symmetry = self._rng.integers(0, SYMMETRIES, len(rows))

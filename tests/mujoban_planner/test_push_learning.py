@@ -95,6 +95,11 @@ def test_an_end_by_time_is_no_end_to_the_critic(by, taught, tmp_path):
     assert (learner.update(batch, 0.5, NaNGuard())["q_loss"] > 1.0) == taught
 
 
+def test_an_end_by_time_is_a_loss_to_the_critic_of_mpo_that_is_told_so(tmp_path):
+    learner, batch = ended(mpo(tmp_path, time_outs_lost=True), "truncated")
+    assert learner.update(batch, 0.5, NaNGuard())["q_loss"] > 1.0
+
+
 @pytest.mark.parametrize(("by", "after"), [("terminated", 7.0), ("truncated", 50.0)])
 def test_a_return_goes_on_with_the_value_of_the_state_in_which_time_ran_out(by, after, tmp_path):
     """The second push ends the episode and pays 7; all states are held to be worth 50, and rewards discounted by 0.97.
