@@ -43,10 +43,8 @@ def difficulty(runs: Sequence[Run], file: Path, ahead: Run | None = None) -> boo
     if not reports:
         return False
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
-    for stale, label in (
-        (False, f"all four modules learned, {DEFAULT_WORLD}\nworld, the planner's policy alone"),
-        (True, "the same with other weights than ship now"),
-    ):
+    alone = f"all four modules learned, {DEFAULT_WORLD}\nworld, the planner's policy alone"
+    for stale, label in ((False, alone), (True, f"{alone},\nother weights than ship now")):
         chosen = [(run, report) for run, report in reports if is_stale(report) == stale]
         if chosen:
             x = [run.difficulty for run, _ in chosen]
