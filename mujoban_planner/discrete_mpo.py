@@ -57,14 +57,12 @@ class MPOSettings:
     """Updates between copies to the target network."""
     q_weight: float = 0.5
     """Weight of the critic's loss."""
-    critic_first: int = 0
-    """Updates in which the critic learns alone and the policy is held; a policy that is good already needs it."""
     seed: int = 0
 
     def __post_init__(self) -> None:
         """Reject numbers with which nothing is played or learned, and what is no share."""
         check_counts(self, "environments", "play", "n_step", "replay_steps", "batch_size", "target_period")
-        check_counts(self, "critic_first", "seed", least=0)
+        check_counts(self, "seed", least=0)
         check_positive(self, "steps_per_update", "learning_rate", "dual_learning_rate")
         check_not_negative(self, "warm_up_steps", "q_weight")
         check_shares(self, "discount")
@@ -165,28 +163,31 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
 
     def update(self, batch: MPOBatch, progress: float, guard: NaNGuard) -> dict[str, float]:
         """Take one gradient step of policy, critic and dual variables."""
-        config, batch = self.config, batch.to(self.device)
+        batch = batch.to(self.device)
+        output, before, q_loss = self.weigh(batch)
+        policy_loss, stats = self.mpo(output.policy, before.policy, before.q)
+        beside = self.further_losses(output, batch.state)
+        loss = policy_loss + self.config.q_weight * q_loss + sum(beside.values())
+        self.count(guarded_step(loss, [self._adam, self._dual_adam], guard, clip=_CLIP) is not None)
+        losses = {name: value.item() for name, value in {"q_loss": q_loss, **beside}.items()}
+        return {**losses, "mean_reward": batch.reward.mean().item()} | scalars(stats._asdict())
+
+    def weigh(self, batch: MPOBatch) -> tuple[Answer, Answer, Tensor]:
+        """Return what online and target network say of the states of a batch on the device, and the critic's loss."""
         with torch.no_grad(), autocast(self.device):
             before, after = self.answers(self.target, batch.state), self.answers(self.target, batch.last)
         target = batch.reward + batch.bootstrap * self.value(after)
         with autocast(self.device):
             output = self.answers(self.network, batch.state)
-        policy_loss, stats = self.mpo(output.policy, before.policy, before.q)
-        if self._updates < config.critic_first:
-            policy_loss = functional.kl_div(
-                output.policy.log_softmax(1), before.policy.log_softmax(1), reduction="batchmean", log_target=True
-            )
         taken = output.q.gather(1, batch.instruction[:, None])[:, 0]
         errors = functional.smooth_l1_loss(taken, target, reduction="none")
-        q_loss = (errors * batch.valid).sum() / batch.valid.sum().clamp(min=1)
-        beside = self.further_losses(output, batch.state)
-        loss = policy_loss + config.q_weight * q_loss + sum(beside.values())
-        if guarded_step(loss, [self._adam, self._dual_adam], guard, clip=_CLIP) is not None:
-            self._updates += 1
-            if self._updates % config.target_period == 0:
-                self.target.load_state_dict(self.network.state_dict())
-        losses = {name: value.item() for name, value in {"q_loss": q_loss, **beside}.items()}
-        return {**losses, "mean_reward": batch.reward.mean().item()} | scalars(stats._asdict())
+        return output, before, (errors * batch.valid).sum() / batch.valid.sum().clamp(min=1)
+
+    def count(self, accepted: bool) -> None:
+        """Count a step unless it was refused; the target network follows."""
+        self._updates += accepted
+        if accepted and self._updates % self.config.target_period == 0:
+            self.target.load_state_dict(self.network.state_dict())
 
     def value(self, answer: Answer) -> Tensor:
         """Return what states are worth, [B]."""

@@ -18,7 +18,7 @@ import torch
 
 from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
-from mujoban_core.ranges import check_not_negative, check_positive
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.discrete_mpo import MPOBatch, StepStore
@@ -46,6 +46,8 @@ class MPOConfig(PlayConfig, NetworkConfig):
     """Teach the push head, by which the policy goes, as well; otherwise the policy only follows it."""
     anchor: float = 0.0
     """How much it counts that the verdicts of weights to start from go on saying what they said; 0 lets them drift."""
+    critic_first: int = 0
+    """Updates in which the critic's head learns alone: weights to start from that are good need it."""
     bag_share: float = 0.25
     """Share of a batch that comes from bags, where there are any; 1: all, and nothing is played."""
     cpu_seconds: float = 1e9
@@ -57,6 +59,7 @@ class MPOConfig(PlayConfig, NetworkConfig):
         NetworkConfig.__post_init__(self)
         check_positive(self, "cpu_seconds")
         check_not_negative(self, "anchor")
+        check_counts(self, "critic_first", least=0)
         if not 0.0 < self.bag_share <= 1.0:
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
 
@@ -123,7 +126,10 @@ class MPOLearner(MoveLearner):
             silence_verdicts(network.heads)
         else:
             reset_stay_logit(network)
-        super().__init__(config, network, device, teach_pushes=config.teach_pushes, anchor=config.anchor)
+        super().__init__(
+            config, network, device, teach_pushes=config.teach_pushes, anchor=config.anchor,
+            critic_first=config.critic_first,
+        )  # fmt: skip
 
     def evaluate(self) -> dict[str, float]:
         """Return solve rates of the target network on held-out levels."""

@@ -89,8 +89,9 @@ class JointLearner(Learner[JointBatch]):
         self.controller = MPOLearner(
             networks.controller.train(), body, settings.controller, generator, critic=critic
         )
+        own = settings.planner
         self.planner = MoveLearner(
-            settings.planner.mpo, networks.planner, teach_pushes=True, anchor=settings.planner.anchor
+            own.mpo, networks.planner, teach_pushes=True, anchor=own.anchor, critic_first=own.critic_first
         )
 
     @property

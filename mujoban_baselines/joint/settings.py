@@ -64,7 +64,7 @@ class PlannerSettings:
     @property
     def mpo(self) -> MPOSettings:
         """What the planner's learner reads of it."""
-        return MPOSettings(learning_rate=self.rate, critic_first=self.critic_first)
+        return MPOSettings(learning_rate=self.rate)
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,35 @@ from mujoban_rl.limits import NaNGuard
 from mujoban_sokoban.generator import generate_batch
 
 
+def random_batch():
+    """Return states of levels, what is done in them, and what it is worth at random."""
+    states = torch.from_numpy(abstract_states(generate_batch(4, range(64))))
+    instruction, reward = torch.arange(64) % 5, torch.linspace(-2.0, 2.0, 64)
+    return MPOBatch(states, instruction, reward, torch.zeros(64), states, torch.ones(64, dtype=torch.bool))
+
+
 def taught(anchor):
     """Teach a planner what is worth what at random; return it, what it began with, states and losses of Q."""
     torch.manual_seed(0)
     start = ResidualPlanner(8, 1, judge=True)
     planner = copy.deepcopy(start)
     learner = MoveLearner(MPOSettings(learning_rate=1e-2), planner, teach_pushes=True, anchor=anchor)
-    states = torch.from_numpy(abstract_states(generate_batch(4, range(64))))
-    instruction, reward = torch.arange(64) % 5, torch.linspace(-2.0, 2.0, 64)
-    batch = MPOBatch(states, instruction, reward, torch.zeros(64), states, torch.ones(64, dtype=torch.bool))
+    batch = random_batch()
     losses = [learner.update(batch, 0.0, NaNGuard())["q_loss"] for _ in range(40)]
-    return planner.eval(), start.eval(), states, losses
+    return planner.eval(), start.eval(), batch.state, losses
+
+
+def test_a_critic_learns_alone_at_first_and_nothing_else_is_touched():
+    torch.manual_seed(0)
+    planner = ResidualPlanner(8, 1, judge=True)
+    before = copy.deepcopy(planner.state_dict())
+    learner = MoveLearner(MPOSettings(learning_rate=1e-2), planner, teach_pushes=True, anchor=0.0, critic_first=20)
+    losses = [learner.update(random_batch(), 0.0, NaNGuard())["q_loss"] for _ in range(20)]
+    assert losses[-1] < 0.95 * losses[0]
+    changed = {name for name, values in learner.weights().items() if not torch.equal(values, before[name])}
+    assert changed == {"readout.q.weight", "readout.q.bias"}
+    learner.update(random_batch(), 0.0, NaNGuard())
+    assert not torch.equal(planner.readout.policy.weight, before["readout.policy.weight"])
 
 
 def test_verdicts_stay_what_they_were_while_the_trunk_learns_what_earns():
