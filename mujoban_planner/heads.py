@@ -99,13 +99,17 @@ class PlannerHeads(nn.Module):
         here = (features * planes[:, AGENT : AGENT + 1]).sum((2, 3))  # Shape [B, C]
         board = functional.relu(self.squeeze(features)).flatten(1)
         hidden = functional.relu(self.board(torch.cat([board, here], 1)))
-        push = self.push(features).float()
-        if reachable is not None:
-            push = push + (legal_pushes(planes, reachable) + 1e-4).log()
-        push = push - push.logsumexp((1, 2, 3), keepdim=True)
+        push = self.next_push(features, planes, reachable)
         push_dead = None if self.push_dead is None else self.push_dead(features).float()
         policy, q, dead = (head(hidden).float() for head in (self.policy, self.q, self.dead))
         return PlannerOutput(policy, q, dead, self.plan(features).float(), push, push_dead)
+
+    def next_push(self, features: Tensor, planes: Tensor, reachable: Tensor | None) -> Tensor:
+        """Return the log-probability of each next push, [B, D, I, I]; arguments as `forward`, features rectified."""
+        push = self.push(features).float()
+        if reachable is not None:
+            push = push + (legal_pushes(planes, reachable) + 1e-4).log()
+        return push - push.logsumexp((1, 2, 3), keepdim=True)
 
     def guide(self, wanted: Tensor, planes: Tensor) -> Tensor | float:
         """Return what the way to the pushes that are wanted adds to the policy's logits, [B, A]; 0 without propagation.

@@ -139,8 +139,8 @@ class PushMPOLearner(Learner[Window]):
         policy_loss, stats = self.mpo(output.logits, before.logits, before.q)
         taken = output.q.gather(1, images(batch["push"][:, 0].numpy(), symmetry)[:, None])[:, 0]
         q_loss = (functional.smooth_l1_loss(taken, goal, reduction="none") * returns.valid).mean()
-        loss = policy_loss + config.q_weight * q_loss
-        parts = {"q_loss": q_loss}
+        parts = {"q_loss": q_loss, "stray": output.stray.mean()}
+        loss = policy_loss + config.q_weight * q_loss + parts["stray"]
         if self._anchor is not None:
             with autocast("cpu"):
                 parts["anchor"] = self._anchor.loss(self.policy.planner, first, symmetry)

@@ -32,6 +32,9 @@ class PushOutput(NamedTuple):
 
     logits: Tensor
     """Of pushes, `_IMPOSSIBLE` where they are not possible, [B, A]."""
+    stray: Tensor
+    """-log of the probability that the push head gives to what is possible, [B], 0 where nothing is. A learner lets it
+    be small: here what is impossible is masked, in the planner's decision it is not."""
     value: Tensor
     """Value of the state, [B]."""
     q: Tensor
@@ -77,13 +80,15 @@ class PushPolicy(nn.Module):
     def forward(self, boards: BitBoards, symmetry: NDArray[np.int64] | None = None) -> PushOutput:
         """Return what the policy says of states, each under its symmetry if given, [B]."""
         possible = _possible(boards, symmetry)
-        features, _, _ = self.planner.perceive(state_tensor(boards, symmetry))
+        features, planes, reachable = self.planner.perceive(state_tensor(boards, symmetry))
         features = functional.relu(features)
-        logits = self.planner.heads.push(features).flatten(1).float()
+        push = self.planner.heads.next_push(features, planes, reachable).flatten(1)
+        logits = push.masked_fill(~possible, _IMPOSSIBLE)
+        stray = -torch.where(possible.any(1), logits.logsumexp(1), 0.0)
         pooled = torch.cat([features.mean((2, 3)), features.amax((2, 3))], 1)
         value = self.board(pooled)[:, 0].float()
         q = value[:, None] + self.pushes(features).flatten(1).float()
-        return PushOutput(logits.masked_fill(~possible, _IMPOSSIBLE), value, q.masked_fill(~possible, 0.0))
+        return PushOutput(logits, stray, value, q.masked_fill(~possible, 0.0))
 
 
 class Anchor:

@@ -111,8 +111,8 @@ class PushPPOLearner(Learner[Arrays]):
                 log_prob = policy.log_prob(push[rows])
                 loss, stats = ppo_loss(log_prob, old[rows], advantage[rows], output.value, target[rows], config.ppo)
                 entropy = policy.entropy().mean()
-                parts = {**stats, "entropy": entropy}
-                loss = loss - config.entropy * entropy
+                parts = {**stats, "entropy": entropy, "stray": output.stray.mean()}
+                loss = loss - config.entropy * entropy + parts["stray"]
                 if self._anchor is not None:
                     with autocast("cpu"):
                         parts["anchor"] = self._anchor.loss(self.policy.planner, states)

@@ -78,6 +78,26 @@ def test_the_loss_teaches_the_push_head_and_the_trunk_but_no_other_head(make, tm
     assert not {"readout.policy", "readout.dead", "readout.push_dead", "readout.walk", "readout.plan"} & changed
 
 
+@pytest.mark.parametrize("make", [ppo, mpo])
+def test_pushes_that_are_impossible_are_learned_not_to_be_wanted(make, tmp_path):
+    trainer = make(tmp_path, learning_rate=1e-2, warm_up=0.0)
+    policy, boards = trainer.learner.policy, bit_boards(generate_batch(4, range(64)))
+
+    def strays():
+        with torch.no_grad():
+            advice = policy.planner(torch.from_numpy(abstract_states(generate_batch(4, range(64)))))
+            output = policy(boards)
+        possible = advice.push.flatten(1).exp() * (output.logits > -1e8)
+        assert torch.allclose(output.stray, -possible.sum(1).log(), atol=1e-3)
+        return float(output.stray.mean())
+
+    policy.planner.heads.push.weight.data.mul_(60.0)
+    before = strays()
+    trainer.run()
+    assert before > 1.0
+    assert strays() < 0.5 * before
+
+
 def ended(trainer, by):
     """Return the learner of a run, and its first batch with a large reward and an end `by` either in every step."""
     trainer.source.publish(trainer.learner.weights(), 0)
