@@ -52,17 +52,18 @@ class PushMPOConfig(PushRunConfig):
     mpo: DiscreteMPOConfig = field(
         default_factory=lambda: DiscreteMPOConfig(epsilon_policy=0.01, initial_temperature=0.3, initial_alpha=1.0)
     )
-    batch_size: int = 512
-    reuse: float = 3.0
+    batch_size: int = 128
+    reuse: float = 1.0
     """Samples that are learned from per push that is played."""
     replay_steps: int = 400
     """Pushes in each level that are kept."""
     first_steps: int = 5120
     """Pushes before the first update."""
-    n_step: int = 5
+    n_step: int = 20
+    """Pushes of a return: by then most levels are decided, and little is left to what the critic guesses."""
     discount: float = 0.97
     """Per push."""
-    time_outs_lost: bool = False
+    time_outs_lost: bool = True
     """Whether a level that time cuts short counts as lost, though how many moves are left is not seen; it is left out
     otherwise."""
     q_weight: float = 5.0

@@ -37,7 +37,7 @@ def ppo(path, seed=0, **options):
 
 
 def mpo(path, seed=0, **options):
-    settings = {"batch_size": 32, "first_steps": 256, "replay_steps": 40, "n_step": 3, **SIZE, **options}
+    settings = {"batch_size": 32, "reuse": 3.0, "first_steps": 256, "replay_steps": 40, "n_step": 3, **SIZE, **options}
     config = PushMPOConfig(play=PLAY, seed=seed, **settings)
     trainer = push_mpo(config, path, Cadence(publish_updates=2, save_seconds=math.inf))
     trainer.learner.evaluate = dict
@@ -111,12 +111,12 @@ def ended(trainer, by):
 def test_an_end_by_time_is_no_end_to_the_critic(by, taught, tmp_path):
     learner, batch = ended(ppo(tmp_path / "ppo"), by)
     assert (learner._advantages(batch)[1].mean() > 50.0) == taught
-    learner, batch = ended(mpo(tmp_path / "mpo"), by)
+    learner, batch = ended(mpo(tmp_path / "mpo", time_outs_lost=False), by)
     assert (learner.update(batch, 0.5, NaNGuard())["q_loss"] > 1.0) == taught
 
 
-def test_an_end_by_time_is_a_loss_to_the_critic_of_mpo_that_is_told_so(tmp_path):
-    learner, batch = ended(mpo(tmp_path, time_outs_lost=True), "truncated")
+def test_an_end_by_time_is_a_loss_to_the_critic_of_mpo_unless_told_otherwise(tmp_path):
+    learner, batch = ended(mpo(tmp_path), "truncated")
     assert learner.update(batch, 0.5, NaNGuard())["q_loss"] > 1.0
 
 
@@ -135,7 +135,7 @@ def test_a_return_goes_on_with_the_value_of_the_state_in_which_time_ran_out(by, 
     carried = 0.97 * 0.95 * (after - 50.0)
     torch.testing.assert_close(target[0], torch.full((16,), 3.0 + 0.97 * 50.0 + carried))
 
-    learner, batch = ended(mpo(tmp_path / "mpo"), by)
+    learner, batch = ended(mpo(tmp_path / "mpo", time_outs_lost=False), by)
     batch["reward"] = torch.tensor([3.0, 7.0, 0.0, 0.0]).repeat(32, 1)
     batch[by] = (torch.arange(4) == 1).repeat(32, 1)
     learner.target.board[-1].bias.data.fill_(50.0)
