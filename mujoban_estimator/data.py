@@ -65,7 +65,7 @@ class Windows(NamedTuple):
     tick: NDArray[np.int64]
     """Ticks within the batch, padded by repeating the last, [W, V]."""
     valid: NDArray[np.bool_]
-    """[W, V]."""
+    """Whether a tick counts, [W, V]: it is no padding, and not an episode's first, at which nothing is in force."""
 
 
 def choose_windows(batch: Batch, frames: int, length: int, rng: np.random.Generator) -> Windows:
@@ -88,7 +88,8 @@ def choose_windows(batch: Batch, frames: int, length: int, rng: np.random.Genera
     chosen = order[np.cumsum(count[order]) - count[order] < frames]
     steps = np.arange(count[chosen].max(initial=1))
     ticks = tick[chosen, None] + np.minimum(steps, count[chosen, None] - 1)
-    return Windows(stream[chosen], ticks, steps < count[chosen, None])
+    begins = batch.first[stream[chosen], None] & (ticks == 0)
+    return Windows(stream[chosen], ticks, (steps < count[chosen, None]) & ~begins)
 
 
 class Batcher:

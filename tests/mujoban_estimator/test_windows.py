@@ -7,12 +7,13 @@ from mujoban_core.bodies import BALL
 from mujoban_estimator.data import Batcher, choose_windows
 
 
-def test_windows_are_whole_instructions_from_their_issue():
+def test_windows_are_whole_instructions_from_their_issue_but_for_the_tick_before_any():
     stream = iter([stretch(20, terminated=(6, 10))])
     batch = next(Batcher([stream], 24, BALL))
     windows = choose_windows(batch, 10_000, 64, np.random.default_rng(0))
     found = sorted(w[v].tolist() for w, v in zip(windows.tick, windows.valid, strict=True))
-    assert found == [list(range(6)), list(range(6, 10)), list(range(10, 20))]
+    assert found == [list(range(1, 6)), list(range(6, 10)), list(range(10, 20))]
+    assert sorted(windows.tick[:, 0]) == [0, 6, 10]  # the network sees that tick all the same, as in play
 
 
 def test_windows_do_not_begin_where_the_issue_is_unknown():
