@@ -42,6 +42,7 @@ QUICK: Final = MPOTrainingConfig(
     windows=16,
     replay=12_000,
     first=1_000,
+    exploration="white",  # a walker without a mass goes where the noise pushes it
     n_step=3,
     reuse=2.0,
     rate=1e-3,

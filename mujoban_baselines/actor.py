@@ -20,6 +20,7 @@ from mujoban_core.agent import AgentInput
 from mujoban_core.interfaces import Memory, renew_rows
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
+from mujoban_rl.exploration import Exploration, Noise
 from mujoban_rl.replay import SequenceBuilder
 
 MEMORY_FIELDS: Final = ("memory0", "memory1")
@@ -50,6 +51,7 @@ class AgentActor(Actor):
         length: int,
         overlap: int,
         beside: tuple[str, ...] = (),
+        exploration: Exploration = "white",
         seed: int = 0,
     ) -> None:
         """Take a seat.
@@ -60,12 +62,14 @@ class AgentActor(Actor):
             length: L.
             overlap: Ticks of a sequence that were in the one before.
             beside: What critics see of the task.
+            exploration: How alike the noise of successive ticks is.
             seed: Of exploration, and of the agent's own random streams.
         """
         self._task, self._agent = task, agent.eval()
         self._beside = tuple(name for name in beside if name not in agent.sees)
         self._builder = SequenceBuilder(length, overlap)
         self._generator = torch.Generator().manual_seed(seed)
+        self._noise = Noise(exploration, task.batch, agent.action_size, self._generator)
         self._rng = np.random.default_rng(seed)
         self._state = agent.initial_state(self._streams(task.batch))
         self._first = np.ones(task.batch, np.bool_)
@@ -92,7 +96,7 @@ class AgentActor(Actor):
         seen = task.observe((*agent.sees, *self._beside))
         sights, memory, others = agent.look(AgentInput(**{name: seen[name] for name in agent.sees}), self._state)
         output = agent(agent.to_tensors(sights), memory)
-        action = output.action.sample(self._generator)
+        action = output.action.at(self._noise.draw()[:, None])
         log_prob = output.action.limited_log_prob(action)[:, 0]
         taken = action[:, 0].numpy()
         step = task.step(taken.clip(-1.0, 1.0))
@@ -104,6 +108,7 @@ class AgentActor(Actor):
         self._state, self._first = (*output.memory, *others), step.over
         rows = np.flatnonzero(step.over)
         if rows.size:
+            self._noise.renew(rows)
             for name, values in task.renew(rows).items():
                 outcomes.setdefault(name, []).extend(values)
             fresh = agent.initial_state(self._streams(task.batch))
@@ -125,7 +130,8 @@ class AgentActor(Actor):
             {"rng": self._rng.bit_generator.state},
             {"generator": self._generator.get_state(), "first": torch.from_numpy(self._first), **memory},
         )
-        return State.of({"own": own, "task": self._task.state(), "builder": self._builder.state()})
+        parts = {"noise": self._noise, "task": self._task, "builder": self._builder}
+        return State.of({"own": own, **{name: part.state() for name, part in parts.items()}})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
@@ -139,6 +145,7 @@ class AgentActor(Actor):
             part if isinstance(before, Tensor) else part.numpy()
             for part, before in zip(restored, self._state, strict=True)
         )
+        self._noise.restore(state.part("noise"))
         self._task.restore(state.part("task"))
         self._builder.restore(state.part("builder"))
 
@@ -154,13 +161,14 @@ AgentFactory = Callable[[], RecurrentAgent]
 
 
 def make_actor(
-    task: TaskFactory, agent: AgentFactory, length: int, overlap: int, beside: tuple[str, ...], seed: int, stream: int
-) -> AgentActor:
+    task: TaskFactory, agent: AgentFactory, length: int, overlap: int, beside: tuple[str, ...],
+    exploration: Exploration, seed: int, stream: int,
+) -> AgentActor:  # fmt: skip
     """Return the actor with a number of its own; with a `functools.partial`, an `ActorFactory`."""
     streams = np.random.SeedSequence([seed, stream]).spawn(2)
     player = agent()
     player.mixed_precision = True
     return AgentActor(
         task(np.random.default_rng(streams[0])), player, length=length, overlap=overlap, beside=beside,
-        seed=int(streams[1].generate_state(1)[0]),
+        exploration=exploration, seed=int(streams[1].generate_state(1)[0]),
     )  # fmt: skip

@@ -24,6 +24,7 @@ from mujoban_baselines.networks import AgentOutput, RecurrentAgent
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_rl.actors import ReplayStore
 from mujoban_rl.engine import Learner, Scalars, State
+from mujoban_rl.exploration import Exploration, check_exploration
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss, check_samples, paired_noise
@@ -52,6 +53,8 @@ class MPOTrainingConfig:
     """Environment steps before the first update."""
     reuse: float = 1.0
     """Times that each step is learned from, on average."""
+    exploration: Exploration = "pink"
+    """Noise of the torques that are tried: white noise finds no reward here."""
     n_step: int = 5
     samples: int = 20
     """N."""
@@ -73,6 +76,7 @@ class MPOTrainingConfig:
     def __post_init__(self) -> None:
         """Reject windows in which nothing is learned, an odd number of samples, and numbers out of their range."""
         check_samples(self.samples)
+        check_exploration(self.exploration)
         check_counts(self, "windows", "n_step", "target_period", "replay")
         check_counts(self, "warm_up", "first", "critic_first", "normalised", least=0)
         check_shares(self, "gamma")

@@ -153,7 +153,7 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
     streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(2)]
     generators = [torch.Generator().manual_seed(seed) for seed in streams]
     plays = task or partial(MujobanTask, config.task)
-    factory = partial(make_actor, plays, build, mpo.window, mpo.overlap, critic.sees, config.seed)
+    factory = partial(make_actor, plays, build, mpo.window, mpo.overlap, critic.sees, mpo.exploration, config.seed)
     store = WindowStore(mpo, generators[0])
     source = ActorSource(actors.pool(factory), store, steps_per_update=mpo.steps_per_update, first_steps=mpo.first)
     return MPOLearner(agent, critic, mpo, generators[1]), source
@@ -166,7 +166,7 @@ def vtrace_parts(
     torch.manual_seed(config.seed)  # the initial weights
     unroll, build = config.vtrace, partial(kind, config.task.body)
     plays = task or partial(MujobanTask, config.task)
-    factory = partial(make_actor, plays, build, unroll.length, 1, (), config.seed)
+    factory = partial(make_actor, plays, build, unroll.length, 1, (), "white", config.seed)
     source = ActorSource(actors.pool(factory), Rollouts(axis=1, count=actors.num_actors))
     return VTraceLearner(build(), unroll), source
 

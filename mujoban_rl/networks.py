@@ -35,6 +35,10 @@ class Gaussian(NamedTuple):
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
         """Return one draw, not limited to [-1, 1]."""
         noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
+        return self.at(noise)
+
+    def at(self, noise: Tensor) -> Tensor:
+        """Return the torques that lie so many standard deviations from the mean, not limited to [-1, 1]."""
         return self.mean + self.scale * noise
 
     def limited_log_prob(self, action: Tensor) -> Tensor:

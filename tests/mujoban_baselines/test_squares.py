@@ -19,7 +19,7 @@ def test_its_map_is_a_room_with_a_robot_a_target_and_a_box():
 
 
 def test_a_walker_reaches_subgoals_by_chance():
-    actor = make_actor(_task, StructuredAgent, 41, 1, (), 0, 0)
+    actor = make_actor(_task, StructuredAgent, 41, 1, (), "white", 0, 0)
     assert actor.act().arrays["pseudo_reward"].sum() > 0.2, "a tenth for each"
 
 

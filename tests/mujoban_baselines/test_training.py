@@ -139,7 +139,7 @@ def test_mujoban_goes_on_to_the_bit_from_its_state():
 def test_an_actor_notes_what_subgoals_paid():
     """A subgoal that is reached pays 0.1, and its sub-episode ends."""
     actor = make_actor(
-        partial(MujobanTask, TaskConfig(robots=3, episode_seconds=5.0)), StructuredAgent, 61, 1, (), 0, 0
+        partial(MujobanTask, TaskConfig(robots=3, episode_seconds=5.0)), StructuredAgent, 61, 1, (), "white", 0, 0
     )
     arrays = actor.act().arrays
     actor.close()
@@ -302,7 +302,7 @@ def test_mpo_learns_to_walk_to_the_red_square_from_nothing():
     learner = MPOLearner(Informed(), InformedCritic(), settings, torch.Generator().manual_seed(1))
     factory = partial(
         make_actor, partial(TellingSquares, batch=16), Informed, settings.window, settings.overlap,
-        InformedCritic.sees, 0,
+        InformedCritic.sees, settings.exploration, 0,
     )
     store = WindowStore(settings, torch.Generator().manual_seed(2))
     source = ActorSource(
