@@ -53,7 +53,7 @@ class Experience:
     steps: int
     """Environment steps in it."""
     statistics: Arrays = field(default_factory=dict)
-    """What happened, such as the returns of the episodes that ended, [n] each with any n; their means are logged."""
+    """What happened, such as returns of the episodes that ended, [n] each with any n; their means and n are logged."""
     version: int = 0
     """Number of updates behind the weights with which it was played; pools fill it in, as well as the rest."""
     actor: int = 0

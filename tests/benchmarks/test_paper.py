@@ -215,10 +215,10 @@ def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
         curves.read_curve("planner", [tmp_path / "missing"])
 
 
-def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
+def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, monkeypatch):
     lines = [
         {"step": 1000 * i, "cpu_seconds": 360.0 * i, "seconds": 180.0 * i, "solved/1": i / 10, "return/1": float(i),
-         "solved/5": None}
+         "count/solved/1": 1 + i % 2, "count/return/1": 1, "solved/5": None}
         for i in range(1, 11)
     ]  # fmt: skip
     (tmp_path / "run").mkdir()
@@ -227,6 +227,8 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path):
     row = next(row for row in baselines.BASELINES if row.name == "mpo_easy")
     cost = {"step": 10_000, "cpu_seconds": 3600, "seconds": 1800}
     assert baselines.points_of(row)[-1] == {**cost, "solved": {"1": 1.0}, "return": {"1": 10.0}}
+    monkeypatch.setattr(baselines, "_MOST", 5)  # lines 9 and 10 are of 2 episodes and of 1
+    assert baselines.read_curve(tmp_path / "run")[-1]["solved"] == {"1": 0.9333}
     write(row.run(1), 3, 4, {"agent": "a" * 64})
     page = results.rebuild(folder).read_text()
     rates = "75.0 % (30.1 to 95.4)" + 4 * " | not measured"
