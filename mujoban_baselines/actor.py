@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mujoban_baselines.networks import Recurrent, RecurrentAgent
 from mujoban_baselines.subgoals import SUBGOAL_REWARD, Subgoals
-from mujoban_baselines.task import Task
+from mujoban_baselines.task import Task, TaskStep
 from mujoban_core.agent import AgentInput
 from mujoban_core.interfaces import Memory, renew_rows
 from mujoban_rl.actors import Actor, Experience
@@ -37,10 +37,10 @@ def memory_of(batch: Mapping[str, Tensor], tick: int = 0) -> Recurrent:
 class AgentActor(Actor):
     """Explores with the agent's distribution over torques.
 
-    Delivered are, [L, B, ...] each: what the agent read and what `beside` names; `action` [U], not limited to
-    [-1, 1], and `log_prob` of what the world takes of it; `reward`, `terminated` and `truncated` of the step; `first`
-    before which ticks an episode begins, and the memory before each; for agents with subgoals also `pseudo_reward` and
-    `pseudo_over`.
+    The agent decides in every so many ticks (`RecurrentAgent.repeat`), which are one tick of a sequence. Delivered are,
+    [L, B, ...] each: what it read and what `beside` names; `action` [U], not limited to [-1, 1], and `log_prob` of what
+    the world takes of it; `reward`, `terminated` and `truncated` of the step; `first` before which ticks an episode
+    begins, and the memory before each; for agents with subgoals also `pseudo_reward` and `pseudo_over`.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class AgentActor(Actor):
         self._beside = tuple(name for name in beside if name not in agent.sees)
         self._builder = SequenceBuilder(length, overlap)
         self._generator = torch.Generator().manual_seed(seed)
-        self._noise = Noise(exploration, task.batch, agent.action_size, self._generator)
+        self._noise = Noise(exploration, task.batch, agent.action_size, self._generator, ticks=agent.repeat)
         self._rng = np.random.default_rng(seed)
         self._state = agent.initial_state(self._streams(task.batch))
         self._first = np.ones(task.batch, np.bool_)
@@ -87,7 +87,8 @@ class AgentActor(Actor):
         outcomes: dict[str, list[float]] = {}
         while sequence is None:
             sequence, ticks = self._builder.add(self._tick(outcomes)), ticks + 1
-        return Experience(sequence, ticks * self._task.batch, {k: np.array(v) for k, v in outcomes.items()})
+        steps = ticks * self._agent.repeat * self._task.batch
+        return Experience(sequence, steps, {k: np.array(v) for k, v in outcomes.items()})
 
     @torch.no_grad()
     def _tick(self, outcomes: dict[str, list[float]]) -> dict[str, NDArray[Any]]:
@@ -99,7 +100,7 @@ class AgentActor(Actor):
         action = output.action.at(self._noise.draw()[:, None])
         log_prob = output.action.limited_log_prob(action)[:, 0]
         taken = action[:, 0].numpy()
-        step = task.step(taken.clip(-1.0, 1.0))
+        step = self._hold(taken.clip(-1.0, 1.0))
         kept = {**sights, **{name: seen[name] for name in self._beside}}
         kept = {name: values.astype(COMPACT.get(name, values.dtype)) for name, values in kept.items()}
         kept |= {name: m.numpy() for name, m in zip(MEMORY_FIELDS, memory, strict=True)}
@@ -114,6 +115,14 @@ class AgentActor(Actor):
             fresh = agent.initial_state(self._streams(task.batch))
             self._state = renew_rows(self._state, fresh, step.over)
         return kept
+
+    def _hold(self, torque: NDArray[np.float32]) -> TaskStep:
+        """Apply torques for as many ticks as the agent holds them; where an episode ends, nothing follows."""
+        step = self._task.step(torque)
+        for _ in range(1, self._agent.repeat):
+            more = self._task.step(torque)
+            step = TaskStep(step.reward + more.reward, more.terminated, more.truncated)
+        return step
 
     def _pseudo_rewards(self, others: Memory, over: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
         """Return what an agent with subgoals got for the step that has been taken."""

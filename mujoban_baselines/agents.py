@@ -20,6 +20,7 @@ from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.interfaces import Memory
+from mujoban_core.ranges import check_counts
 from mujoban_rl.networks import frame_encoder, rows_of_sky
 
 
@@ -49,17 +50,19 @@ class MonolithicAgent(RecurrentAgent):
 
     sees = ("frame", "proprio", "pose")
 
-    def __init__(self, body: str = "ball", size: str = "S") -> None:
-        """Build a variant of the network.
+    def __init__(self, body: str = "ball", size: str = "S", repeat: int = 1) -> None:
+        """Build a variant of the network, whose torques are to be held for `repeat` ticks.
 
         Raises:
-            ValueError: If body or size are unknown.
+            ValueError: If body or size are unknown, or torques held for no tick.
         """
         if size not in SIZES:
             raise ValueError(f"size {size!r}: expected one of {', '.join(SIZES)}")
         chosen = SIZES[size]
         super().__init__(body, chosen.features, chosen.hidden, [chosen.features] * (1 + chosen.extra))
-        self.config["size"] = size
+        self.repeat = repeat
+        check_counts(self, "repeat")
+        self.config |= {"size": size, "repeat": repeat}
         # What lies above the horizon shows the heading, which is in o_pos.
         self.first_row = rows_of_sky(get_body(body).camera, 2 ** (len(chosen.channels) - 1))
         self.encoder = frame_encoder(chosen.channels, chosen.features, FRAME_SIZE - self.first_row)

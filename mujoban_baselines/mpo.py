@@ -48,7 +48,7 @@ class MPOTrainingConfig:
     windows: int = 10
     """M."""
     replay: int = 32_000
-    """Environment steps in the replay; each is a frame, and checkpoints carry them."""
+    """Decisions in the replay; each is a frame, and checkpoints carry them."""
     first: int = 8_000
     """Environment steps before the first update."""
     reuse: float = 1.0
@@ -93,7 +93,7 @@ class MPOTrainingConfig:
 
     @property
     def steps_per_update(self) -> float:
-        """Environment steps that are collected for each update."""
+        """Decisions that are collected for each update."""
         return self.windows * (self.window - self.overlap) / self.reuse
 
 

@@ -95,6 +95,9 @@ class RecurrentAgent(nn.Module, Agent):
     As an `Agent` it is deterministic: the mean torque, limited to [-1, 1]. Subclasses build the encoder.
     """
 
+    repeat: int = 1
+    """Ticks for which whoever plays holds a torque; the ticks of this class are those in which it is asked."""
+
     def __init__(self, body: str, embedded: int, hidden: int, trunk: Sequence[int]) -> None:
         """Build what follows the encoder.
 

@@ -88,6 +88,9 @@ class MPORunConfig(PlayConfig):
 
     size: Size = "S"
     """Variant of the network."""
+    repeat: int = 1
+    """Ticks for which each torque is held, in play as well (action repeat); returns, windows and the replay count
+    decisions."""
     critic: Literal["asymmetric", "symmetric"] = "asymmetric"
     """What the critic sees: the simulator's truth, or what the agent sees, on one torso."""
     start: Path | None = None
@@ -143,11 +146,12 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
     torch.manual_seed(config.seed)  # the initial weights
     body, mpo = config.task.body, config.mpo
     if config.start is None:
-        agent = MonolithicAgent(body, config.size)
+        agent = MonolithicAgent(body, config.size, config.repeat)
     else:
         agent = load_weights(MonolithicAgent, config.start, body=body).train()
-        if (size := agent.config["size"]) != config.size:
-            raise ValueError(f"--size {config.size}: {config.start} holds weights of size {size}, expected that")
+        for name in ("size", "repeat"):
+            if (held := agent.config[name]) != (asked := getattr(config, name)):
+                raise ValueError(f"--{name} {asked}: {config.start} holds weights of {name} {held}, expected that")
     build = partial(MonolithicAgent, **agent.config)
     critic: Critic = AsymmetricCritic(body) if config.critic == "asymmetric" else SymmetricCritic(body, agent.width)
     streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(2)]
@@ -155,7 +159,8 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
     plays = task or partial(MujobanTask, config.task)
     factory = partial(make_actor, plays, build, mpo.window, mpo.overlap, critic.sees, mpo.exploration, config.seed)
     store = WindowStore(mpo, generators[0])
-    source = ActorSource(actors.pool(factory), store, steps_per_update=mpo.steps_per_update, first_steps=mpo.first)
+    steps = agent.repeat * mpo.steps_per_update
+    source = ActorSource(actors.pool(factory), store, steps_per_update=steps, first_steps=mpo.first)
     return MPOLearner(agent, critic, mpo, generators[1]), source
 
 

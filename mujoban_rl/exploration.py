@@ -35,7 +35,9 @@ class Noise:
     Ornstein-Uhlenbeck processes of equal variance, whose times lie evenly on a logarithmic scale.
     """
 
-    def __init__(self, kind: Exploration, robots: int, actuators: int, generator: torch.Generator) -> None:
+    def __init__(
+        self, kind: Exploration, robots: int, actuators: int, generator: torch.Generator, *, ticks: int = 1
+    ) -> None:
         """Begin with every part in its stationary distribution.
 
         Args:
@@ -43,20 +45,21 @@ class Noise:
             robots: B.
             actuators: U.
             generator: CPU source of all draws.
+            ticks: From one draw to the next.
 
         Raises:
             ValueError: If there is no such kind.
         """
         check_exploration(kind)
         self._generator = generator
-        self._keeps = torch.tensor([np.exp(-1.0 / t) if t > 0 else 0.0 for t in FADES[kind]])[:, None, None].float()
+        self._keeps = torch.tensor([np.exp(-ticks / t) if t > 0 else 0.0 for t in FADES[kind]])[:, None, None].float()
         self._parts = self._normal(robots, actuators)
 
     def _normal(self, robots: int, actuators: int) -> Tensor:
         return torch.randn(len(self._keeps), robots, actuators, generator=self._generator)
 
     def draw(self) -> Tensor:
-        """Return the noise of the next tick, [B, U]."""
+        """Return the next noise, [B, U]."""
         fresh = self._normal(*self._parts.shape[1:])
         self._parts = self._keeps * self._parts + (1.0 - self._keeps.square()).sqrt() * fresh
         return self._parts.sum(0) / len(self._keeps) ** 0.5
