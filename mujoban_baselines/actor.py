@@ -120,8 +120,9 @@ class AgentActor(Actor):
         """Apply torques for as many ticks as the agent holds them; where an episode ends, nothing follows."""
         step = self._task.step(torque)
         for _ in range(1, self._agent.repeat):
-            more = self._task.step(torque)
-            step = TaskStep(step.reward + more.reward, more.terminated, more.truncated)
+            more, on = self._task.step(torque), ~step.over
+            ends = (step.terminated | (more.terminated & on), step.truncated | (more.truncated & on))
+            step = TaskStep(step.reward + more.reward * on, *ends)
         return step
 
     def _pseudo_rewards(self, others: Memory, over: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:

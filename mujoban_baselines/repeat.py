@@ -28,6 +28,7 @@ class Repeating(Agent):
         self.inner, self.ticks, self._actuators = inner, ticks, actuators
         check_counts(self, "ticks")
         self.sees = inner.sees
+        self.config = getattr(inner, "config", {})  # by which programs tell the body that it was trained for
 
     def initial_memory(self, batch: int) -> Memory:
         """Return the state at the start of `batch` episodes, all of seed 0."""

@@ -67,7 +67,7 @@ class Task(ABC):
 
     @abstractmethod
     def step(self, torque: NDArray[np.float32]) -> TaskStep:
-        """Apply torques in [-1, 1], [B, U], for one step; a row that is over stands still, without reward."""
+        """Apply torques in [-1, 1], [B, U], for one step."""
 
     @abstractmethod
     def renew(self, rows: NDArray[np.int64]) -> dict[str, list[float]]:

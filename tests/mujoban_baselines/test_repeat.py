@@ -11,6 +11,7 @@ from mujoban_baselines.repeat import Repeating
 from mujoban_baselines.task import Task, TaskStep
 from mujoban_core.agent import Agent, AgentInput
 from mujoban_core.interfaces import renew_rows
+from mujoban_core.plugins import check_body
 from mujoban_rl.weights import save_weights
 
 
@@ -59,6 +60,8 @@ def test_weights_are_played_as_they_were_trained(tmp_path):
         torques.append(torque)
     changed = [i for i in range(1, 8) if not np.array_equal(torques[i], torques[i - 1])]
     assert changed == [4] and not played.privileged
+    with pytest.raises(ValueError, match="was trained for the body ball: expected weights for ant"):
+        check_body("agent", played, "ant")
     with pytest.raises(ValueError, match="repeat is 0: expected at least 1"):
         MonolithicAgent(repeat=0)
 
@@ -77,10 +80,8 @@ class Tape(Task):
 
     def step(self, torque):
         self.torques.append(torque)
-        over = np.full(2, self.age >= 6)
         self.tick, self.age = self.tick + 1, self.age + 1
-        reward = np.where(over, 0.0, self.tick).astype(np.float32)
-        return TaskStep(reward, np.zeros(2, np.bool_), np.full(2, self.age >= 6))
+        return TaskStep(np.full(2, self.tick, np.float32), np.zeros(2, np.bool_), np.full(2, self.age == 6))
 
     def renew(self, rows):
         self.age = 0

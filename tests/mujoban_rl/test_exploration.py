@@ -41,6 +41,11 @@ def test_the_power_of_pink_noise_falls_as_one_over_the_frequency():
     assert -1.3 < slope < -0.8
 
 
+def test_noise_that_is_drawn_now_and_then_fades_as_fast():
+    seldom = Noise("pink", 64, 2, torch.Generator().manual_seed(1), ticks=4)
+    assert abs(alike(played(seldom), 1) - alike(played(noise("pink")), 4)) < 0.05
+
+
 def test_robots_and_motors_are_independent_and_a_new_episode_begins_anew():
     of = noise("pink", robots=512)
     before = of.draw()
