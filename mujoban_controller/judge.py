@@ -20,6 +20,7 @@ from mujoban_controller.goal_task import EpisodeEnd, GoalTask, Outcome
 from mujoban_core.grid import Instruction
 from mujoban_core.interfaces import Planner
 from mujoban_core.stats import wilson_interval
+from mujoban_rl.metrics import COUNT
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import VALIDATION_SEEDS
@@ -89,7 +90,7 @@ class OutcomeSummary:
         values: dict[str, float] = {}
         for kind, entry in self.report()["kinds"].items():
             values[f"instruction/{kind}"] = entry["success_rate"]
-            values[f"instruction/{kind}_n"] = entry["n"]
+            values[f"instruction/{kind}{COUNT}"] = entry["n"]
             if entry["median_steps"] is not None:
                 values[f"steps/{kind}"] = entry["median_steps"]
         return values

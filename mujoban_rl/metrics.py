@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+COUNT: Final = "_n"
+"""Ends the name under which a line says of how many values a mean is."""
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
@@ -25,3 +29,13 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
         why = "no metrics.jsonl" if isinstance(error, OSError) else f"metrics.jsonl: {error}"
         raise ValueError(f"{run}: {why}, expected the run directory of a trainer") from error
     return lines
+
+
+def mean_of(lines: Iterable[dict[str, Any]], keys: Sequence[str]) -> tuple[float, float] | None:
+    """Return the mean of what lines say under some names, and of how many values it is; None if that is none.
+
+    Each value counts once, a mean of n as n: episodes that are solved end sooner than others, in lines with few.
+    """
+    said = [(line[key], line.get(key + COUNT, 1.0)) for line in lines for key in keys if line.get(key) is not None]
+    total = sum(count for _, count in said)
+    return (sum(value * count for value, count in said) / total, total) if total else None

@@ -10,7 +10,7 @@ The first writes `baseline_<name>.jsonl`, an object a line with `step`, `cpu_sec
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -26,7 +26,7 @@ from mujoban_core.files import write_atomically
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import ROLES
 from mujoban_core.program import read_options, run_command
-from mujoban_rl.actors.source import COUNT
+from mujoban_rl.metrics import mean_of
 from mujoban_sim.presets import DEFAULT_WORLD
 
 PROG: Final = "benchmarks.paper.baselines"
@@ -187,20 +187,10 @@ def read_curve(run: Path) -> list[dict[str, Any]]:
         spent = ("step", "cpu_seconds", "seconds")
         point: dict[str, Any] = {kind: round((part[-1].get(kind) or 0) + before.get(kind, 0)) for kind in spent}
         for kind in _KINDS:
-            means = {str(d): _mean(part, f"{kind}/{d}") for d in DIFFICULTIES}
-            point[kind] = {d: round(mean, 4) for d, mean in means.items() if mean is not None}
+            means = {str(d): mean_of(part, [f"{kind}/{d}"]) for d in DIFFICULTIES}
+            point[kind] = {d: round(mean[0], 4) for d, mean in means.items() if mean is not None}
         points.append(point)
     return points
-
-
-def _mean(lines: Iterable[dict[str, Any]], key: str) -> float | None:
-    """Return the mean over the episodes that ended within some lines of metrics; None where none did.
-
-    Each counts once: those that are solved end sooner than the others, and hence in lines with few.
-    """
-    ended = [(line[key], line[f"{COUNT}/{key}"]) for line in lines if line.get(key) is not None]
-    episodes = sum(count for _, count in ended)
-    return sum(mean * count for mean, count in ended) / episodes if episodes else None
 
 
 def points_of(baseline: Baseline) -> list[dict[str, Any]]:

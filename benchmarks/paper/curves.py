@@ -85,7 +85,8 @@ def read_curve(module: str, runs: Sequence[Path], offset: float = 0.0) -> list[d
         lines += [(offset + line["step"], line) for line in read_metrics(run)]
         offset = lines[-1][0] if lines else offset
     for measure in MEASURES[module]:
-        points = [(step, *value) for step, line in lines if (value := _value(line, measure)) is not None]
+        values = [(step, metrics.mean_of([line], measure.keys)) for step, line in lines]
+        points = [(step, *value) for step, value in values if value is not None]
         if len(points) >= _FEWEST:
             return [{"step": round(step), "value": value, "what": measure.what} for step, value in _thin(points)]
     wanted = ", ".join(key for measure in MEASURES[module] for key in measure.keys)
@@ -102,13 +103,6 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
         return metrics.read_metrics(run)
     except ValueError as error:
         raise ResultError(str(error)) from error
-
-
-def _value(line: dict[str, Any], measure: Measure) -> tuple[float, float] | None:
-    """Return the measure's value in a line of the metrics and its count, or None if it has none."""
-    present = [(line[key], line.get(f"{key}_n", 1.0)) for key in measure.keys if line.get(key) is not None]
-    total = sum(count for _, count in present)
-    return (sum(value * count for value, count in present) / total, total) if total else None
 
 
 def _thin(points: Sequence[tuple[float, float, float]]) -> list[tuple[float, float]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -14,10 +14,9 @@ from torch import Tensor
 from mujoban_rl.actors.actor import Arrays, Experience
 from mujoban_rl.actors.pool import ActorPool
 from mujoban_rl.engine import Scalars, Source, State
+from mujoban_rl.metrics import COUNT
 from mujoban_rl.replay import SequenceReplay
 
-COUNT: Final = "count"
-"""Leads the name of how many a mean is of: means of lines are weighed by it."""
 BatchT = TypeVar("BatchT")
 _BatchT_co = TypeVar("_BatchT_co", covariant=True)
 
@@ -105,7 +104,7 @@ class ActorSource(Source[BatchT], Generic[BatchT]):
         start, steps = self._since
         self._since = time.monotonic(), 0
         values = {name: float(np.mean(seen)) for name, seen in self._seen.items() if seen}
-        values |= {f"{COUNT}/{name}": float(len(seen)) for name, seen in self._seen.items() if seen}
+        values |= {name + COUNT: float(len(seen)) for name, seen in self._seen.items() if seen}
         values["actors/frames_per_second"] = steps / max(time.monotonic() - start, 1e-9)
         if self._staleness:
             values["actors/staleness"] = float(np.mean(self._staleness))

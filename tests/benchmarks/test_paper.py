@@ -218,7 +218,7 @@ def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
 def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, monkeypatch):
     lines = [
         {"step": 1000 * i, "cpu_seconds": 360.0 * i, "seconds": 180.0 * i, "solved/1": i / 10, "return/1": float(i),
-         "count/solved/1": 1 + i % 2, "count/return/1": 1, "solved/5": None}
+         "solved/1_n": 1 + i % 2, "return/1_n": 1, "solved/5": None}
         for i in range(1, 11)
     ]  # fmt: skip
     (tmp_path / "run").mkdir()
