@@ -16,6 +16,7 @@ def load(path: str | Path | None = None, device: str = "cpu") -> Agent:
         mujoban_rl.weights.WeightsError: If there are none, or they are damaged or do not fit.
     """
     from mujoban_baselines.agents import AGENTS
+    from mujoban_baselines.drawing import Drawing
     from mujoban_baselines.repeat import Repeating
     from mujoban_rl.weights import WeightsError, load_weights, read_record
 
@@ -25,4 +26,5 @@ def load(path: str | Path | None = None, device: str = "cpu") -> Agent:
     if name not in AGENTS:
         raise WeightsError(f"{path}: holds weights of {name}, expected one of {', '.join(AGENTS)}")
     agent = load_weights(AGENTS[name], path, device)
-    return agent if agent.repeat == 1 else Repeating(agent, agent.repeat, agent.action_size)
+    played = agent if agent.draws is None else Drawing(agent, agent.draws)
+    return played if agent.repeat == 1 else Repeating(played, agent.repeat, agent.action_size)

@@ -21,6 +21,7 @@ from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.interfaces import Memory
 from mujoban_core.ranges import check_counts
+from mujoban_rl.exploration import Exploration, check_exploration
 from mujoban_rl.networks import frame_encoder, rows_of_sky
 
 
@@ -50,19 +51,30 @@ class MonolithicAgent(RecurrentAgent):
 
     sees = ("frame", "proprio", "pose")
 
-    def __init__(self, body: str = "ball", size: str = "S", repeat: int = 1) -> None:
-        """Build a variant of the network, whose torques are to be held for `repeat` ticks.
+    def __init__(
+        self, body: str = "ball", size: str = "S", repeat: int = 1, draws: Exploration | None = None
+    ) -> None:
+        """Build a variant of the network.
+
+        Args:
+            body: Key in `mujoban_core.bodies.BODIES`.
+            size: Key of `SIZES`.
+            repeat: Ticks for which its torques are to be held.
+            draws: Noise by which they are to be drawn in play; None: their means are played.
 
         Raises:
-            ValueError: If body or size are unknown, or torques held for no tick.
+            ValueError: If body, size or noise are unknown, or torques held for no tick.
         """
         if size not in SIZES:
             raise ValueError(f"size {size!r}: expected one of {', '.join(SIZES)}")
         chosen = SIZES[size]
         super().__init__(body, chosen.features, chosen.hidden, [chosen.features] * (1 + chosen.extra))
-        self.repeat = repeat
+        self.repeat, self.draws = repeat, draws
         check_counts(self, "repeat")
         self.config |= {"size": size, "repeat": repeat}
+        if draws is not None:
+            check_exploration(draws)
+            self.config["draws"] = draws
         # What lies above the horizon shows the heading, which is in o_pos.
         self.first_row = rows_of_sky(get_body(body).camera, 2 ** (len(chosen.channels) - 1))
         self.encoder = frame_encoder(chosen.channels, chosen.features, FRAME_SIZE - self.first_row)

@@ -19,6 +19,7 @@ from mujoban_baselines.networks import RecurrentAgent
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_rl.actors import Arrays
 from mujoban_rl.engine import Learner, Scalars
+from mujoban_rl.exploration import Exploration, check_exploration
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.vtrace import VTraceConfig, VTraceStats, vtrace_loss
 from mujoban_rl.optimise import ProgressSchedule, guarded_step
@@ -43,6 +44,8 @@ class VTraceTrainingConfig:
     no reward leads back."""
     normalised: int = 500
     """Updates after which the normalisation of proprioception stays as it is."""
+    exploration: Exploration = "white"
+    """How alike the noise of successive ticks is."""
     loss: VTraceConfig = field(default_factory=VTraceConfig)
 
     def __post_init__(self) -> None:
@@ -51,6 +54,7 @@ class VTraceTrainingConfig:
         check_shares(self, "gamma")
         check_positive(self, "gamma", "rate", "clip")
         check_not_negative(self, "auxiliary", "beyond")
+        check_exploration(self.exploration)
 
     @property
     def length(self) -> int:

@@ -19,6 +19,7 @@ from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import GRID_SIZE
 from mujoban_core.interfaces import Memory
+from mujoban_rl.exploration import Exploration
 from mujoban_rl.networks import Gaussian, Normaliser, PreActivatedBlock, encode_frames, gaussian, gaussian_layers
 
 Sights = Mapping[str, NDArray[Any]]
@@ -97,6 +98,8 @@ class RecurrentAgent(nn.Module, Agent):
 
     repeat: int = 1
     """Ticks for which whoever plays holds a torque; the ticks of this class are those in which it is asked."""
+    draws: Exploration | None = None
+    """Noise by which whoever plays draws the torques; None: he takes their means."""
 
     def __init__(self, body: str, embedded: int, hidden: int, trunk: Sequence[int]) -> None:
         """Build what follows the encoder.
@@ -179,8 +182,13 @@ class RecurrentAgent(nn.Module, Agent):
         return {k: torch.from_numpy(np.ascontiguousarray(v)).to(device).unsqueeze(1) for k, v in sights.items()}
 
     @torch.inference_mode()
-    def step(self, inputs: AgentInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
-        """Return the mean torque limited to [-1, 1], [B, U], and the next state."""
+    def respond(self, inputs: AgentInput, state: Memory) -> tuple[Gaussian, Memory]:
+        """Return the distribution over the torques of this tick, mean and scale [B, U], and the next state."""
         sights, memory, others = self.look(inputs, state)
         output = self.forward(self.to_tensors(sights), memory)
-        return output.action.mean[:, 0].clamp(-1.0, 1.0).cpu().numpy(), (*output.memory, *others)
+        return Gaussian(*(part[:, 0] for part in output.action)), (*output.memory, *others)
+
+    def step(self, inputs: AgentInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
+        """Return the mean torque limited to [-1, 1], [B, U], and the next state."""
+        torque, state = self.respond(inputs, state)
+        return torque.mean.clamp(-1.0, 1.0).cpu().numpy(), state

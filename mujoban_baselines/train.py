@@ -40,6 +40,7 @@ from mujoban_core.threads import set_threads
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
+from mujoban_rl.exploration import Exploration
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import load_weights, origin, provenance
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -91,6 +92,8 @@ class MPORunConfig(PlayConfig):
     repeat: int = 1
     """Ticks for which each torque is held, in play as well (action repeat); returns, windows and the replay count
     decisions."""
+    draws: Exploration | None = None
+    """Noise by which its torques are drawn in play, too, such as that by which it explores; None: their means."""
     critic: Literal["asymmetric", "symmetric"] = "asymmetric"
     """What the critic sees: the simulator's truth, or what the agent sees, on one torso."""
     start: Path | None = None
@@ -146,11 +149,11 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
     torch.manual_seed(config.seed)  # the initial weights
     body, mpo = config.task.body, config.mpo
     if config.start is None:
-        agent = MonolithicAgent(body, config.size, config.repeat)
+        agent = MonolithicAgent(body, config.size, config.repeat, config.draws)
     else:
         agent = load_weights(MonolithicAgent, config.start, body=body).train()
-        for name in ("size", "repeat"):
-            if (held := agent.config[name]) != (asked := getattr(config, name)):
+        for name in ("size", "repeat", "draws"):
+            if (held := agent.config.get(name)) != (asked := getattr(config, name)):
                 raise ValueError(f"--{name} {asked}: {config.start} holds weights of {name} {held}, expected that")
     build = partial(MonolithicAgent, **agent.config)
     critic: Critic = AsymmetricCritic(body) if config.critic == "asymmetric" else SymmetricCritic(body, agent.width)
@@ -171,7 +174,7 @@ def vtrace_parts(
     torch.manual_seed(config.seed)  # the initial weights
     unroll, build = config.vtrace, partial(kind, config.task.body)
     plays = task or partial(MujobanTask, config.task)
-    factory = partial(make_actor, plays, build, unroll.length, 1, (), "white", config.seed)
+    factory = partial(make_actor, plays, build, unroll.length, 1, (), unroll.exploration, config.seed)
     source = ActorSource(actors.pool(factory), Rollouts(axis=1, count=actors.num_actors))
     return VTraceLearner(build(), unroll), source
 

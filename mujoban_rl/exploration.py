@@ -26,6 +26,27 @@ def check_exploration(kind: str) -> None:
         raise ValueError(f"exploration {kind!r}: expected one of {', '.join(FADES)}")
 
 
+def kept(kind: Exploration, ticks: int) -> Tensor:
+    """Return the share of each part that is left after so many ticks, [K].
+
+    Raises:
+        ValueError: If there is no such kind.
+    """
+    check_exploration(kind)
+    return torch.tensor([np.exp(-ticks / t) if t > 0 else 0.0 for t in FADES[kind]]).float()
+
+
+def fade(parts: Tensor, fresh: Tensor, keeps: Tensor) -> Tensor:
+    """Return the next parts, [..., K, U], of those before and standard normal ones, of which `keeps` [K] are left."""
+    keeps = keeps[:, None]
+    return keeps * parts + (1.0 - keeps.square()).sqrt() * fresh
+
+
+def mix(parts: Tensor) -> Tensor:
+    """Return the noise that parts [..., K, U] make up, [..., U]."""
+    return parts.sum(-2) / parts.shape[-2] ** 0.5
+
+
 class Noise:
     """Standard normal noise for each motor of B robots, white or pink.
 
@@ -50,23 +71,21 @@ class Noise:
         Raises:
             ValueError: If there is no such kind.
         """
-        check_exploration(kind)
-        self._generator = generator
-        self._keeps = torch.tensor([np.exp(-ticks / t) if t > 0 else 0.0 for t in FADES[kind]])[:, None, None].float()
+        self._generator, self._keeps = generator, kept(kind, ticks)
         self._parts = self._normal(robots, actuators)
 
     def _normal(self, robots: int, actuators: int) -> Tensor:
-        return torch.randn(len(self._keeps), robots, actuators, generator=self._generator)
+        return torch.randn(robots, len(self._keeps), actuators, generator=self._generator)
 
     def draw(self) -> Tensor:
         """Return the next noise, [B, U]."""
-        fresh = self._normal(*self._parts.shape[1:])
-        self._parts = self._keeps * self._parts + (1.0 - self._keeps.square()).sqrt() * fresh
-        return self._parts.sum(0) / len(self._keeps) ** 0.5
+        robots, _, actuators = self._parts.shape
+        self._parts = fade(self._parts, self._normal(robots, actuators), self._keeps)
+        return mix(self._parts)
 
     def renew(self, rows: NDArray[Any]) -> None:
         """Begin anew for some robots, whose episodes begin: rows int [M]."""
-        self._parts[:, torch.from_numpy(rows)] = self._normal(len(rows), self._parts.shape[2])
+        self._parts[torch.from_numpy(rows)] = self._normal(len(rows), self._parts.shape[2])
 
     def state(self) -> State:
         """Return what changes, but the generator."""
