@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
 from mujoban_core.bodies import FIRST_PERSON_CAMERA
-from mujoban_core.camera import TOP_DOWN_CAMERA
+from mujoban_core.camera import FRAME_SIZE, TOP_DOWN_CAMERA
 from mujoban_core.interfaces import GroundTruth, Observation, module_seeds, renew_rows
 from mujoban_core.sense_plan_act import Decision
 from mujoban_core.trees import map_leaves
@@ -34,6 +34,10 @@ class Policy(Protocol):
 
     def initial_state(self, seeds: NDArray[np.int64]) -> Any:
         """Return the state at the start of episodes with the given seeds, [B]."""
+        ...
+
+    def looks(self, state: Any) -> NDArray[np.bool_] | None:
+        """Return which robots look at their frames in the coming tick, [B]; None: all do."""
         ...
 
     def step(self, obs: Observation, truth: GroundTruth, state: Any) -> tuple[Decision, Any]:
@@ -89,7 +93,8 @@ def ticks(
     The modules' random streams come from `run_seed` and the number of the episode, not from its level.
 
     Rows without a further episode leave the policy's batch, so that the last, long episodes cost no more
-    than they must. Frames are rendered if the policy looks at them, unless `camera` says otherwise.
+    than they must. Frames are rendered if and when the policy looks at them, and black otherwise, unless `camera` says
+    that all are, or none.
     """
     if not episodes:
         return
@@ -101,13 +106,14 @@ def ticks(
     step = np.zeros(len(rows), np.int64)
     seeds = module_seeds(run_seed, episode + 1)
     state = policy.initial_state(seeds)
-    camera = FIRST_PERSON_CAMERA in policy.cameras if camera is None else camera
+    asked, camera = camera is None, FIRST_PERSON_CAMERA in policy.cameras if camera is None else camera
     above = TOP_DOWN_CAMERA in policy.cameras
     torque = np.zeros((world.batch, world.body.action_size), np.float32)
     instruction = np.zeros(world.batch, np.int64)
     issued = np.zeros(world.batch, np.bool_)
     while True:
-        observation, truth = observe(world, rows, camera=camera), tell(world, rows, above=above)
+        looking = policy.looks(state) if asked else None
+        observation, truth = observe(world, rows, camera=camera, looking=looking), tell(world, rows, above=above)
         decision, state = policy.step(observation, truth, state)
         torque[:], issued[:] = 0.0, False
         torque[rows], instruction[rows], issued[rows] = decision.torque, decision.instruction, decision.issued
@@ -207,7 +213,19 @@ def tell(world: World, rows: NDArray[np.int64], *, above: bool) -> GroundTruth:
     return truth._replace(top_down=world.render(TOP_DOWN_CAMERA, rows=rows)) if above else truth
 
 
-def observe(world: World, rows: NDArray[np.int64], *, camera: bool = True) -> Observation:
-    """Return what the robots in the given rows perceive; without `camera` the frames are empty, [M, 0, 0, 3]."""
-    frame = world.render("first_person", rows=rows) if camera else np.zeros((len(rows), 0, 0, 3), np.uint8)
+def observe(
+    world: World, rows: NDArray[np.int64], *, camera: bool = True, looking: NDArray[np.bool_] | None = None
+) -> Observation:
+    """Return what the robots in the given rows perceive.
+
+    Without `camera` the frames are empty, [M, 0, 0, 3]; of those that are not `looking`, [M], they are black.
+    """
+    if not camera:
+        frame = np.zeros((len(rows), 0, 0, 3), np.uint8)
+    elif looking is None:
+        frame = world.render(FIRST_PERSON_CAMERA, rows=rows)
+    else:
+        frame = np.zeros((len(rows), FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+        if looking.any():
+            frame[looking] = world.render(FIRST_PERSON_CAMERA, rows=rows[looking])
     return Observation(frame, world.proprio[rows], world.pose[rows])

@@ -70,6 +70,10 @@ class Agent(Module):
         """Return the state at the start of episodes with the given seeds of random streams, [B]."""
         return self.initial_memory(len(seeds))
 
+    def looks(self, state: Memory) -> NDArray[np.bool_] | None:
+        """Return which robots look in the coming tick, [B]; the frames of others may be black. None: all do."""
+        return None
+
     @abstractmethod
     def step(self, inputs: AgentInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques normalised to [-1, 1], [B, U], and the next state."""
@@ -115,6 +119,10 @@ class AgentPolicy:
     def initial_state(self, seeds: NDArray[np.int64]) -> Memory:
         """Return the state at the start of episodes with the given seeds, [B]."""
         return self.agent.initial_state(seeds)
+
+    def looks(self, state: Memory) -> NDArray[np.bool_] | None:
+        """Return which robots look in the coming tick, [B]; None: all do."""
+        return self.agent.looks(state)
 
     def step(self, obs: Observation, truth: GroundTruth, state: Memory) -> tuple[Decision, Memory]:
         """Return the decision of a tick, in which no instruction is issued, and the next state."""

@@ -87,6 +87,9 @@ class SensePlanAct:
             np.zeros(len(seeds), np.bool_),
         )
 
+    def looks(self, state: PolicyState) -> None:
+        """Return None: the estimator looks in every tick."""
+
     def step(self, obs: Observation, truth: GroundTruth, state: PolicyState) -> tuple[Decision, PolicyState]:
         """Return the decision of tick t and the next state; `truth` reaches privileged modules only."""
         estimate, estimator_state = self.estimator.step(

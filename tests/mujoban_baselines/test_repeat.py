@@ -4,15 +4,18 @@ import numpy as np
 import pytest
 import torch
 
+from bringup.rollout import ticks
 from mujoban_baselines import load
 from mujoban_baselines.actor import AgentActor
 from mujoban_baselines.agents import MonolithicAgent
 from mujoban_baselines.repeat import Repeating
 from mujoban_baselines.task import Task, TaskStep
-from mujoban_core.agent import Agent, AgentInput
+from mujoban_core.agent import Agent, AgentInput, AgentPolicy
 from mujoban_core.interfaces import renew_rows
 from mujoban_core.plugins import check_body
 from mujoban_rl.weights import save_weights
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
 
 
 class Counting(Agent):
@@ -64,6 +67,22 @@ def test_weights_are_played_as_they_were_trained(tmp_path):
         check_body("agent", played, "ant")
     with pytest.raises(ValueError, match="repeat is 0: expected at least 1"):
         MonolithicAgent(repeat=0)
+
+
+def test_frames_that_nobody_looks_at_are_not_drawn(monkeypatch):
+    torch.manual_seed(0)
+    policy = AgentPolicy(Repeating(MonolithicAgent(repeat=4).eval(), 4, actuators=2))
+    render, drawn, played = World.render, [], []
+    monkeypatch.setattr(World, "render", lambda *args, rows: drawn.append(len(rows)) or render(*args, rows=rows))
+    for camera in (None, True):
+        world = World(2, max_boxes=1, time_limit=6)
+        told = [tick.decision.torque for tick in ticks(policy, world, Episodes(3, 20, difficulty=1), camera=camera)]
+        played.append((np.concatenate(told), sum(drawn)))
+        drawn.clear()
+        world.close()
+    assert np.array_equal(played[0][0], played[1][0])
+    # In three episodes of 6 ticks: what two decisions rest on, or all ticks, and what is there behind the last.
+    assert [frames for _, frames in played] == [3 * (2 + 1), 3 * (6 + 1)]
 
 
 class Tape(Task):
