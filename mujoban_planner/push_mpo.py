@@ -74,13 +74,16 @@ class PushMPOConfig(PushRunConfig):
     dual_learning_rate: float = 1e-2
     warm_up: float = 0.01
     """Share of the budget in which the learning rate rises."""
+    last_rate: float = 0.1
+    """Share of the learning rate that is left at the end. With less than a twentieth the policy no longer keeps up with
+    the bound of its KL, whose dual variable falls to 0, and then runs after the critic's errors."""
 
     def __post_init__(self) -> None:
         """Reject numbers with which nothing is learned, and what is no share."""
         super().__post_init__()
         check_counts(self, "batch_size", "replay_steps", "first_steps", "n_step")
         check_positive(self, "reuse", "q_weight", "learning_rate", "dual_learning_rate")
-        check_shares(self, "discount", "average", "warm_up")
+        check_shares(self, "discount", "average", "warm_up", "last_rate")
 
 
 class PushMPOLearner(Learner[Window]):
@@ -95,7 +98,7 @@ class PushMPOLearner(Learner[Window]):
         self.mpo = DiscreteMPO(config.mpo)
         self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5, fused=True)
         self._dual_adam = self.mpo.duals.adam(config.dual_learning_rate)
-        self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up))
+        self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up, config.last_rate))
         self._rng = np.random.default_rng([config.seed, 8])
 
     @property

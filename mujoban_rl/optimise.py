@@ -88,11 +88,11 @@ class ProgressSchedule:
             self._scheduler.step()
 
 
-def warm_up_cosine(warm_up: float) -> Callable[[float], float]:
-    """Return a schedule that rises over a share `warm_up` of the budget and falls to 0 along a half cosine."""
+def warm_up_cosine(warm_up: float, last: float = 0.0) -> Callable[[float], float]:
+    """Return a schedule that rises over a share `warm_up` of the budget and falls along a half cosine, to `last`."""
 
     def factor(progress: float) -> float:
-        return _rise(progress, warm_up) * 0.5 * (1.0 + math.cos(math.pi * progress))
+        return _rise(progress, warm_up) * (last + (1.0 - last) * 0.5 * (1.0 + math.cos(math.pi * progress)))
 
     return factor
 

@@ -102,6 +102,13 @@ def same(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
 
 
+@pytest.mark.parametrize("last", [0.0, 0.1])
+def test_a_rate_rises_and_falls_to_what_is_to_be_left_of_it(last):
+    rate = warm_up_cosine(0.1, last)
+    assert rate(0.0) == 0.0 and rate(0.1) == pytest.approx(1.0, abs=0.03) and rate(1.0) == pytest.approx(last)
+    assert rate(0.05) < rate(0.1) > rate(0.5) > rate(0.9)
+
+
 def test_a_run_interrupted_by_a_signal_and_resumed_equals_one_that_never_stopped(tmp_path, capsys):
     whole = trainer(tmp_path / "whole")
     assert whole.run()
