@@ -36,7 +36,7 @@ class Policy(Protocol):
         """Return the state at the start of episodes with the given seeds, [B]."""
         ...
 
-    def looks(self, state: Any) -> NDArray[np.bool_] | None:
+    def robots_looking(self, state: Any) -> NDArray[np.bool_] | None:
         """Return which robots look at their frames in the coming tick, [B]; None: all do."""
         ...
 
@@ -112,7 +112,7 @@ def ticks(
     instruction = np.zeros(world.batch, np.int64)
     issued = np.zeros(world.batch, np.bool_)
     while True:
-        looking = policy.looks(state) if asked else None
+        looking = policy.robots_looking(state) if asked else None
         observation, truth = observe(world, rows, camera=camera, looking=looking), tell(world, rows, above=above)
         decision, state = policy.step(observation, truth, state)
         torque[:], issued[:] = 0.0, False

@@ -39,14 +39,14 @@ class Repeating(Agent):
         rest = np.zeros((len(seeds), self._actuators), np.float32)
         return (*self.inner.initial_state(seeds), rest, np.zeros(len(seeds), np.int64))
 
-    def looks(self, state: Memory) -> NDArray[np.bool_]:
+    def robots_looking(self, state: Memory) -> NDArray[np.bool_]:
         """Return which robots are asked in the coming tick, [B]."""
         return state[-1] % self.ticks == 0
 
     def step(self, inputs: AgentInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques, [B, U], and the next state."""
         *own, held, tick = state
-        inner, rows = tuple(own), np.flatnonzero(self.looks(state))
+        inner, rows = tuple(own), np.flatnonzero(self.robots_looking(state))
         if rows.size:
             seen = AgentInput(**{name: getattr(inputs, name)[rows] for name in self.sees})
             torque, after = self.inner.step(seen, take_rows(inner, rows))

@@ -70,7 +70,7 @@ class Agent(Module):
         """Return the state at the start of episodes with the given seeds of random streams, [B]."""
         return self.initial_memory(len(seeds))
 
-    def looks(self, state: Memory) -> NDArray[np.bool_] | None:
+    def robots_looking(self, state: Memory) -> NDArray[np.bool_] | None:
         """Return which robots look in the coming tick, [B]; the frames of others may be black. None: all do."""
         return None
 
@@ -120,9 +120,9 @@ class AgentPolicy:
         """Return the state at the start of episodes with the given seeds, [B]."""
         return self.agent.initial_state(seeds)
 
-    def looks(self, state: Memory) -> NDArray[np.bool_] | None:
+    def robots_looking(self, state: Memory) -> NDArray[np.bool_] | None:
         """Return which robots look in the coming tick, [B]; None: all do."""
-        return self.agent.looks(state)
+        return self.agent.robots_looking(state)
 
     def step(self, obs: Observation, truth: GroundTruth, state: Memory) -> tuple[Decision, Memory]:
         """Return the decision of a tick, in which no instruction is issued, and the next state."""

@@ -87,7 +87,7 @@ class SensePlanAct:
             np.zeros(len(seeds), np.bool_),
         )
 
-    def looks(self, state: PolicyState) -> None:
+    def robots_looking(self, state: PolicyState) -> None:
         """Return None: the estimator looks in every tick."""
 
     def step(self, obs: Observation, truth: GroundTruth, state: PolicyState) -> tuple[Decision, PolicyState]:
