@@ -13,7 +13,7 @@ from torch import Tensor
 from mujoban_baselines.networks import RecurrentAgent
 from mujoban_core.agent import Agent, AgentInput
 from mujoban_core.interfaces import Memory, counter_uniform
-from mujoban_rl.exploration import FADES, Exploration, fade, kept, mix
+from mujoban_rl.exploration import Exploration, fade, kept, mix
 
 
 class Drawing(Agent):
@@ -30,14 +30,14 @@ class Drawing(Agent):
         """
         self.inner, self.sees, self.config = inner, inner.sees, inner.config
         self._keeps = kept(noise, inner.repeat)
-        self._shape = (len(FADES[noise]), inner.action_size)
+        self._shape = (len(self._keeps), inner.action_size)
 
     def initial_memory(self, batch: int) -> Memory:
         """Return the state at the start of `batch` episodes, all of seed 0."""
         return self.initial_state(np.zeros(batch, np.int64))
 
     def initial_state(self, seeds: NDArray[np.int64]) -> Memory:
-        """Return the state at the start of episodes with the given seeds, [B]; every part is as later in the mean."""
+        """Return the state at the start of episodes with the given seeds, [B]; the noise is as strong as later."""
         seeds, drawn = np.asarray(seeds, np.int64), np.zeros(len(seeds), np.int64)
         parts, drawn = self._normal(seeds, drawn)
         return (*self.inner.initial_state(seeds), parts.numpy(), seeds, drawn)
@@ -45,7 +45,7 @@ class Drawing(Agent):
     def _normal(self, seeds: NDArray[np.int64], drawn: NDArray[np.int64]) -> tuple[Tensor, NDArray[np.int64]]:
         """Return standard normal draws, [B, K, U], and how many there have been since."""
         size = int(np.prod(self._shape))
-        even = np.stack([counter_uniform(seeds, drawn + i) for i in range(size)], -1)
+        even = counter_uniform(seeds[:, None], drawn[:, None] + np.arange(size))
         # The ends of (0, 1) are infinitely far out.
         normal = torch.special.ndtri(torch.from_numpy(even).clamp(1e-12, 1.0 - 1e-12))
         return normal.view(-1, *self._shape).float(), drawn + size

@@ -32,8 +32,8 @@ class RandomAgent(Agent):
         seed, drawn = state
         assert inputs.proprio is not None
         size = _actuators(inputs.proprio.shape[1])
-        draws = [counter_uniform(seed, drawn + i) for i in range(size)]
-        return np.stack([2.0 * d - 1.0 for d in draws], -1).astype(np.float32), (seed, drawn + size)
+        draws = counter_uniform(seed[:, None], drawn[:, None] + np.arange(size))
+        return (2.0 * draws - 1.0).astype(np.float32), (seed, drawn + size)
 
 
 def _actuators(felt: int) -> int:

@@ -116,7 +116,7 @@ def renew_rows(state: StateT, fresh: StateT, done: NDArray[np.bool_]) -> StateT:
 
 
 def counter_uniform(seed: NDArray[np.int64], counter: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return uniform draws in [0, 1) that depend on (seed, counter) alone, [B] (splitmix64).
+    """Return uniform draws in [0, 1) that depend on (seed, counter) alone, of their common shape (splitmix64).
 
     Stateless draws keep a rollout independent of the batch that it runs in.
     """

@@ -12,7 +12,7 @@ from mujoban_core.interfaces import renew_rows, take_rows
 from mujoban_rl.weights import save_weights
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def agent():
     torch.manual_seed(0)
     return MonolithicAgent(repeat=4, draws="pink").eval()
