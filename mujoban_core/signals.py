@@ -22,7 +22,8 @@ from mujoban_core.worker import end_workers
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, a polite kill, a terminal that was closed."""
-_COMPILERS: Final = ("numba", "llvmlite")
+_UNSAFE: Final = ("numba", "llvmlite", "ctypes")
+"""Packages in which an interruption is lost or ends the process: see `_put_off`."""
 _LATER: Final = 0.05
 """Seconds after which a signal that was put off comes again."""
 _LOST: Final = 0.3
@@ -226,13 +227,14 @@ class StopSignal:
 
 
 def _put_off(number: int, frame: FrameType | None) -> bool:
-    """Tell whether a signal came while functions were being compiled; it will then come again.
+    """Tell whether a signal came where nothing must be raised; it will then come again.
 
-    What is raised there is lost in a callback of LLVM, with words on the terminal, or comes out as another error. A
-    first start compiles for some seconds, later ones not at all.
+    What is raised while functions are compiled is lost in a callback of LLVM, with words on the terminal, or comes out
+    as another error. A first start compiles for some seconds, later ones not at all. And a compiled function that takes
+    a random generator asks `ctypes.cast` for addresses and does not look whether that failed: a segmentation fault.
     """
     while frame is not None:
-        if frame.f_globals.get("__name__", "").partition(".")[0] in _COMPILERS:
+        if frame.f_globals.get("__name__", "").partition(".")[0] in _UNSAFE:
             later = threading.Timer(_LATER, os.kill, (os.getpid(), number))
             later.daemon = True
             later.start()

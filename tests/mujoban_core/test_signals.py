@@ -185,3 +185,28 @@ def test_a_signal_while_a_function_is_compiled_waits_until_that_is_done(context)
         inside["compile"]()
         time.sleep(5.0)
     assert done == [True]
+
+
+INTERRUPTED_CAST = """
+import ctypes, signal, sys
+from mujoban_core.program import exit_status
+from mujoban_sokoban.generator import generate_level
+
+def interrupt(frame, event, argument):
+    if event == "call" and frame.f_code is ctypes.cast.__code__ and frame.f_locals["typ"] is ctypes.c_void_p:
+        sys.setprofile(None)
+        signal.raise_signal(signal.SIGINT)
+
+def generate():
+    sys.setprofile(interrupt)
+    while True:
+        generate_level(5, 0)
+
+generate_level(5, 0)  # compile
+sys.exit(exit_status("levels", generate))
+"""
+
+
+def test_a_signal_while_a_compiled_function_takes_its_random_generator_ends_a_program_in_order():
+    ended = subprocess.run([sys.executable, "-c", INTERRUPTED_CAST], capture_output=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stderr.strip()) == (130, b"levels: interrupted")
