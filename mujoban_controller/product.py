@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
-from torch import Tensor
-
 from mujoban_controller.judge import judge
 from mujoban_controller.policy import GoalPolicy
+from mujoban_rl.best import Best
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
@@ -44,11 +43,7 @@ class ProductLearner(Learner[BatchT]):
     def __init__(self, validation: Validation) -> None:
         """Compare products by `validation`."""
         self._validation = validation
-        self._best_score: tuple[float, float] | None = None
-        self._best_weights: dict[str, Tensor] = {}
-        self._best_scalars: dict[str, float] = {}
-        self._best_at: int | None = None
-        self._evaluations = 0
+        self.best = Best()
 
     @property
     @abstractmethod
@@ -65,10 +60,7 @@ class ProductLearner(Learner[BatchT]):
 
     def state(self) -> State:
         """Return what changes beside modules and optimisers."""
-        score = None if self._best_score is None else list(self._best_score)
-        found = {"scalars": self._best_scalars, "at": self._best_at, "evaluations": self._evaluations}
-        best = State({"score": score, **found}, self._best_weights)
-        return State.of({"own": self.own_state(), "best": best})
+        return State.of({"own": self.own_state(), "best": self.best.state()})
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
@@ -77,12 +69,7 @@ class ProductLearner(Learner[BatchT]):
 
     def restore_best(self, state: State) -> None:
         """Take over the best product and its score."""
-        score = state.values["score"]
-        self._best_weights = state.tensors
-        self._best_score = None if score is None else tuple(score)
-        # Runs that were begun earlier know the rates alone.
-        self._best_scalars = state.values.get("scalars") or dict(zip(_RATES, score or (), strict=False))
-        self._best_at, self._evaluations = state.values.get("at"), state.values.get("evaluations", 1)
+        self.best.restore(state)
 
     def evaluate(self) -> Scalars:
         """Return how many validation levels the product solves under a solver's plans; keep it if it is the best."""
@@ -101,10 +88,7 @@ class ProductLearner(Learner[BatchT]):
         kinds = report["instructions"]["kinds"]
         medians = {f"steps/{k}": v["median_steps"] for k, v in kinds.items() if v["median_steps"] is not None}
         scalars = {**dict(zip(_RATES, score, strict=True)), "steps": report["median_steps"], **medians}
-        if self._best_score is None or score >= self._best_score:
-            self._best_score, self._best_scalars, self._best_at = score, scalars, self._evaluations
-            self._best_weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
-        self._evaluations += 1
+        self.best.judge(product, score, scalars)
         return scalars
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
@@ -115,6 +99,6 @@ class ProductLearner(Learner[BatchT]):
         """
         product = self.product
         chosen = type(product)(**product.config)
-        chosen.load_state_dict(self._best_weights or product.state_dict())
-        told = {"validation": self._best_scalars or None, "evaluation": self._best_at}
-        save_weights(directory.path / f"{product.file_name}.safetensors", chosen, product.config, {**record, **told})
+        chosen.load_state_dict(self.best.weights(product))
+        record = {**record, **self.best.told}
+        save_weights(directory.path / f"{product.file_name}.safetensors", chosen, product.config, record)

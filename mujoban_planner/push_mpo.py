@@ -27,6 +27,7 @@ from mujoban_planner.push_run import PushRunConfig, starting_anchor, starting_po
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.validation import success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
+from mujoban_rl.best import Best
 from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
@@ -87,7 +88,7 @@ class PushMPOConfig(PushRunConfig):
 
 
 class PushMPOLearner(Learner[Window]):
-    """Learns from windows of the replay, each under a random symmetry."""
+    """Learns from windows of the replay, each under a random symmetry; what solved most held-out levels is exported."""
 
     def __init__(self, config: PushMPOConfig) -> None:
         """Build a policy, or start from a planner's weights."""
@@ -100,6 +101,7 @@ class PushMPOLearner(Learner[Window]):
         self._dual_adam = self.mpo.duals.adam(config.dual_learning_rate)
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up, config.last_rate))
         self._rng = np.random.default_rng([config.seed, 8])
+        self.best = Best()
 
     @property
     def target(self) -> PushPolicy:
@@ -117,12 +119,17 @@ class PushMPOLearner(Learner[Window]):
         return {"adam": self._adam, "duals": self._dual_adam}
 
     def state(self) -> State:
-        """Return the random state."""
-        return State({"rng": self._rng.bit_generator.state})
+        """Return the random state and the best planner."""
+        return State.of({"own": State({"rng": self._rng.bit_generator.state}), "best": self.best.state()})
 
     def restore(self, state: State) -> None:
-        """Take over the random state."""
-        self._rng.bit_generator.state = state.values["rng"]
+        """Take over what `state` returned."""
+        self._rng.bit_generator.state = state.part("own").values["rng"]
+        self.restore_best(state.part("best"))
+
+    def restore_best(self, state: State) -> None:
+        """Take over the best planner and its score."""
+        self.best.restore(state)
 
     def update(self, batch: Window, progress: float, guard: NaNGuard) -> Scalars:
         """Take a step of policy, critic and dual variables."""
@@ -159,13 +166,18 @@ class PushMPOLearner(Learner[Window]):
         return self.policy.state_dict()
 
     def evaluate(self) -> Scalars:
-        """Return the averaged planner's solve rates, alone, on held-out levels."""
-        return success_rates(self.target.planner)
+        """Return the averaged planner's solve rates, alone, on held-out levels; keep it if it is the best."""
+        planner = self.target.planner
+        rates = success_rates(planner)
+        self.best.judge(planner, tuple(rates.values()), rates)
+        return rates
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the averaged planner's weights with their record."""
+        """Write the best averaged planner, or the present one where none was judged, with its record."""
         planner = self.target.planner
-        save_weights(directory.path / "planner.safetensors", planner, planner.config, record)
+        best = self.config.network.build()
+        best.load_state_dict(self.best.weights(planner))
+        save_weights(directory.path / "planner.safetensors", best, planner.config, {**record, **self.best.told})
 
 
 def _boards(batch: Window, rows: Tensor, at: Tensor) -> BitBoards:

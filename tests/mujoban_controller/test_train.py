@@ -162,7 +162,7 @@ def test_the_best_product_on_validation_levels_is_exported(teacher, tmp_path):
         for parameter in learner.policy.parameters():
             parameter.zero_()
     first = learner.evaluate()
-    learner._best_score = (2.0, 2.0)
+    learner.best._score = (2.0, 2.0)
     with torch.no_grad():
         learner.policy.log_scale.fill_(-1.0)
     assert learner.evaluate() == first

@@ -1,0 +1,57 @@
+"""The best product of a run so far, by its score on validation levels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor, nn
+
+from mujoban_rl.engine import Scalars, State
+
+
+class Best:
+    """Keeps the weights that scored best: late products differ by more than training improves them, or are worse."""
+
+    def __init__(self) -> None:
+        """Know none yet."""
+        self._score: tuple[float, ...] | None = None
+        self._weights: dict[str, Tensor] = {}
+        self._scalars: Scalars = {}
+        self._at: int | None = None
+        self._judged = 0
+
+    def judge(self, product: nn.Module, score: tuple[float, ...], scalars: Scalars) -> None:
+        """Keep a product unless an earlier one has scored more.
+
+        Args:
+            product: As it is now.
+            score: What products are compared by, in this order; the newest of equal ones is kept.
+            scalars: What the evaluation found.
+        """
+        if self._score is None or score >= self._score:
+            self._score, self._scalars, self._at = score, scalars, self._judged
+            self._weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
+        self._judged += 1
+
+    def weights(self, product: nn.Module) -> Mapping[str, Tensor]:
+        """Return the best weights, or those of the present product where none was judged."""
+        return self._weights or product.state_dict()
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """For the record: under `validation` what was found, under `evaluation` in which evaluation, from 0."""
+        return {"validation": self._scalars or None, "evaluation": self._at}
+
+    def state(self) -> State:
+        """Return all of it."""
+        score = None if self._score is None else list(self._score)
+        found = {"score": score, "scalars": self._scalars, "at": self._at, "evaluations": self._judged}
+        return State(found, self._weights)
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        score = state.values["score"]
+        self._score = None if score is None else tuple(score)
+        self._weights, self._scalars = state.tensors, state.values["scalars"]
+        self._at, self._judged = state.values["at"], state.values["evaluations"]

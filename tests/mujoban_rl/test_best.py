@@ -1,0 +1,35 @@
+import torch
+from torch import nn
+
+from mujoban_rl.best import Best
+
+
+def product(value):
+    module = nn.Linear(1, 1)
+    nn.init.constant_(module.weight, value)
+    return module
+
+
+def test_the_newest_of_the_best_is_kept_with_what_was_found():
+    best = Best()
+    for value, score in enumerate([(0.5, 0.1), (0.5, 0.2), (0.5, 0.2), (0.4, 0.9)]):
+        best.judge(product(float(value)), score, {"rate": score[0] + score[1]})
+    again = Best()
+    again.restore(best.state())
+    again.judge(product(9.0), (0.0, 1.0), {})
+    assert float(again.weights(product(8.0))["weight"]) == 2.0
+    assert again.told == {"validation": {"rate": 0.7}, "evaluation": 2}
+
+
+def test_what_is_kept_does_not_change_with_the_product():
+    best, learned = Best(), product(1.0)
+    best.judge(learned, (1.0,), {})
+    nn.init.constant_(learned.weight, 2.0)
+    assert float(best.weights(learned)["weight"]) == 1.0
+
+
+def test_without_a_judgement_the_present_product_is_the_best():
+    best, present = Best(), product(3.0)
+    best.restore(best.state())
+    torch.testing.assert_close(dict(best.weights(present)), dict(present.state_dict()))
+    assert best.told == {"validation": None, "evaluation": None}
