@@ -13,7 +13,7 @@ from bringup.pipeline import Pipeline
 class Display:
     """A line a stage: what it has taken of what it may take, and when all are expected to be done.
 
-    A pipe or file is told when each begins and ends.
+    A pipe or file is told when each begins, has taken another tenth of its time, and ends.
     """
 
     def __init__(self, pipeline: Pipeline, console: Console) -> None:
@@ -26,7 +26,7 @@ class Display:
         self._tasks: dict[str, TaskID] = {
             s.name: self.progress.add_task(s.name, total=s.seconds, note="waits") for s in pipeline.stages
         }
-        self._states = dict.fromkeys(self._tasks, "waits")
+        self._told = dict.fromkeys(self._tasks, "waits")
 
     def update(self, pipeline: Pipeline) -> None:
         """Show how far every stage is."""
@@ -39,15 +39,21 @@ class Display:
             if done:
                 state, note = "done", f"done in {_minutes(spent)}"
             elif stage.name in pipeline.running():
-                state, note = "runs", f"{_minutes(spent)} of about {_minutes(stage.seconds)}"
+                note = f"{_minutes(spent)} of about {_minutes(stage.seconds)}"
+                state = f"runs, part {_part(spent / stage.seconds)}"
             else:
                 state = note = "waits"
             shown = stage.seconds if done else min(spent, stage.seconds)
             self.progress.update(self._tasks[stage.name], completed=shown, note=note)
-            if self.progress.disable and state != self._states[stage.name]:
+            if self.progress.disable and state != self._told[stage.name]:
                 line = f"{stage.name}: {note}" + ("" if done else f"; all is expected to end on {ends}")
                 self.progress.console.print(line, highlight=False, soft_wrap=True)
-            self._states[stage.name] = state
+            self._told[stage.name] = state
+
+
+def _part(share: float) -> int:
+    """Return how many tenths of its time a stage has taken; beyond its time only wholes count."""
+    return int(10 * share) if share < 1.0 else 9 + int(share)
 
 
 def _minutes(seconds: float) -> str:

@@ -95,6 +95,18 @@ def test_a_pipe_gets_a_line_whenever_another_tenth_of_the_episodes_has_ended():
     assert console.file.getvalue().splitlines()[10:] == ["24 of 25 episodes recorded", "25 of 25 episodes recorded"]
 
 
+def test_a_pipe_is_told_of_every_tenth_of_a_stage_and_rarely_once_its_time_is_over(tmp_path, monkeypatch):
+    pipeline = Pipeline(tmp_path, [Stage("planner", (), (tmp_path / "made",), seconds=600.0)])
+    monkeypatch.setattr(pipeline, "running", lambda: ["planner"])
+    pipe = Console(file=io.StringIO(), width=60)
+    with (display := Display(pipeline, pipe)).progress:
+        for spent in range(0, 1500, 10):
+            monkeypatch.setattr(pipeline, "elapsed", lambda name, spent=spent: float(spent))
+            display.update(pipeline)
+    told = [line.split(";")[0] for line in pipe.file.getvalue().splitlines()]
+    assert told == [f"planner: {n} of about 10 min" for n in ("0 s", *(f"{m} min" for m in (*range(1, 11), 20)))]
+
+
 def test_stages_are_told_as_they_begin_and_end_in_a_pipe_and_fit_60_columns_of_a_terminal(tmp_path):
     product = tmp_path / "made"
     stages = [
