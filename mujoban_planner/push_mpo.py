@@ -21,7 +21,6 @@ from torch.nn import functional
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards, signed
-from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.push_actor import BOARDS, STEP, PlayConfig, PushActor
 from mujoban_planner.push_policy import PushPolicy, images
 from mujoban_planner.push_run import PushRunConfig, starting_anchor, starting_policy, training_record
@@ -71,10 +70,7 @@ class PushMPOConfig(PushRunConfig):
     q_weight: float = 5.0
     """Weight of the critic's loss."""
     average: float = 0.99
-    """Share of the target network that an update leaves."""
-    shipped_average: float = 0.9995
-    """Share of the shipped network that an update leaves: far slower, as one target solves several points more or less
-    than the next while both learn no more."""
+    """Share of the target network that an update leaves; it is what is shipped."""
     learning_rate: float = 1e-3
     dual_learning_rate: float = 1e-2
     warm_up: float = 0.01
@@ -88,7 +84,7 @@ class PushMPOConfig(PushRunConfig):
         super().__post_init__()
         check_counts(self, "batch_size", "replay_steps", "first_steps", "n_step")
         check_positive(self, "reuse", "q_weight", "learning_rate", "dual_learning_rate")
-        check_shares(self, "discount", "average", "shipped_average", "warm_up", "last_rate")
+        check_shares(self, "discount", "average", "warm_up", "last_rate")
 
 
 class PushMPOLearner(Learner[Window]):
@@ -100,7 +96,6 @@ class PushMPOLearner(Learner[Window]):
         self.policy = starting_policy(config)
         self._anchor = starting_anchor(config, self.policy)
         self._average = moving_average(self.policy, config.average, warm_up=True)
-        self._shipped = moving_average(self.policy.planner, config.shipped_average, warm_up=True)
         self.mpo = DiscreteMPO(config.mpo)
         self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5, fused=True)
         self._dual_adam = self.mpo.duals.adam(config.dual_learning_rate)
@@ -114,14 +109,9 @@ class PushMPOLearner(Learner[Window]):
         return self._average.module
 
     @property
-    def shipped(self) -> LearnedPlanner:
-        """The planner, averaged over more updates than the target."""
-        return self._shipped.module
-
-    @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """Policy, target, what ships and dual variables."""
-        return {"policy": self.policy, "target": self._average, "shipped": self._shipped, "mpo": self.mpo}
+        """Policy, target and dual variables."""
+        return {"policy": self.policy, "target": self._average, "mpo": self.mpo}
 
     @property
     def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
@@ -168,7 +158,6 @@ class PushMPOLearner(Learner[Window]):
             loss = loss + parts["anchor"]
         if guarded_step(loss, [self._adam, self._dual_adam], guard, clip=5.0) is not None:
             self._average.update_parameters(self.policy)
-            self._shipped.update_parameters(self.policy.planner)
         parts["mean_return"] = goal.mean()
         return scalars(stats._asdict()) | {name: float(value.detach()) for name, value in parts.items()}
 
@@ -178,15 +167,17 @@ class PushMPOLearner(Learner[Window]):
 
     def evaluate(self) -> Scalars:
         """Return the averaged planner's solve rates, alone, on held-out levels; keep it if it is the best."""
-        rates = success_rates(self.shipped)
-        self.best.judge(self.shipped, tuple(rates.values()), rates)
+        planner = self.target.planner
+        rates = success_rates(planner)
+        self.best.judge(planner, tuple(rates.values()), rates)
         return rates
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the best averaged planner, or the present one where none was judged, with its record."""
+        planner = self.target.planner
         best = self.config.network.build()
-        best.load_state_dict(self.best.weights(self.shipped))
-        save_weights(directory.path / "planner.safetensors", best, best.config, {**record, **self.best.told})
+        best.load_state_dict(self.best.weights(planner))
+        save_weights(directory.path / "planner.safetensors", best, planner.config, {**record, **self.best.told})
 
 
 def _boards(batch: Window, rows: Tensor, at: Tensor) -> BitBoards:

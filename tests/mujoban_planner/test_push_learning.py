@@ -56,7 +56,7 @@ def test_mpo_exports_the_planner_that_solved_most_held_out_levels(monkeypatch, t
     monkeypatch.setattr("mujoban_planner.push_mpo.success_rates", lambda planner: next(found))
     trainer = mpo(tmp_path)
     del trainer.learner.evaluate  # the learner's own
-    weight = trainer.learner.shipped.encoder.weight
+    weight = trainer.learner.target.planner.encoder.weight
     for value in (1.0, 2.0):
         weight.data.fill_(value)
         trainer.learner.evaluate()
