@@ -242,6 +242,14 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, mo
         results.rebuild(folder)
 
 
+def test_the_modular_row_has_a_cost_and_no_curve(folder):
+    cost = {"step": 1_000_000, "cpu_seconds": 7200, "seconds": 3600, "solved": {}, "return": {}}
+    baselines.MODULAR.curve.write_text(json.dumps(cost) + "\n")
+    page = results.rebuild(folder).read_text()
+    assert "| 1.00 M | 2.0 | 1.0 |" in page and "The curves of agents: not measured yet" in page
+    assert not (folder / "baselines.png").exists()
+
+
 def test_an_agent_that_was_trained_anew_is_measured_anew(folder, monkeypatch, capsys):
     weights = folder / "agent.safetensors"
     run = runs.Run("mine", "mine", 1, agent=weights)
