@@ -72,6 +72,13 @@ class Baseline:
     """Folder of its run that holds the weights."""
     seed: int = 0
     """Of the run; with another one, the same is trained once more."""
+    guide: str = ""
+    """Page that says how it is trained, seen from that of the results."""
+
+    @property
+    def label(self) -> str:
+        """What a legend says of it."""
+        return f"{self.title} ({self.levels})"
 
     @property
     def folder(self) -> Path:
@@ -131,8 +138,9 @@ _PARTIAL, _FULL, _NOT = "5 days, 256 actors", "21 days, 1,000 actors", "not ther
 _MPO: Final = "monolithic-mpo --repeat 4 --mpo.reuse 4 --draws pink"
 """What solves most of difficulty 1 (docs/research/baselines.md); what goes on from a clone acts as that does."""
 MODULAR: Final = Baseline(
-    "modular", "modular", _ROBOT, "all difficulties, bottom-up ([how](../weights.md))", f"--world {DEFAULT_WORLD}",
+    "modular", "modular", _ROBOT, "all difficulties, bottom-up", f"--world {DEFAULT_WORLD}",
     "7 days, 200 to 1,000 actors a module", tuple(ROLES), "bringup.train_all", weights="weights",
+    guide="../weights.md",
 )  # fmt: skip
 """The stack, from nothing within the same hours."""
 BASELINES: Final = (

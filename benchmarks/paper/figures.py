@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.paper import runs as sources
-from benchmarks.paper.baselines import AGAIN, BASELINES, Baseline, points_of
+from benchmarks.paper.baselines import AGAIN, BASELINES, points_of
 from benchmarks.paper.curves import MODULES
 from benchmarks.paper.runs import ResultError, Run, is_stale, load
 from mujoban_core.grid import DIFFICULTIES
@@ -68,7 +67,7 @@ def difficulty(runs: Sequence[Run], file: Path, ahead: Run | None = None) -> boo
         if measured:
             rates = [report["success_rate"] for _, report in measured]
             bars = list(zip(*(margins(report) for _, report in measured), strict=True))
-            label = _label(row)
+            label = row.label
             x = [d for d, _ in measured]
             axes.errorbar(x, rates, yerr=bars, capsize=2, marker=".", linewidth=1, label=label)
     paper = [(run.difficulty, run.paper_success) for run, _ in reports if run.paper_success is not None]
@@ -90,11 +89,6 @@ def save_rates(figure: Figure, axes: Axes, file: Path) -> None:
     plt.close(figure)
 
 
-def _label(row: Baseline) -> str:
-    """Return what a legend says of a row of Table 1, where no link leads anywhere."""
-    return f"{row.title} ({re.sub(r' [(][[].*?[]][(].*?[)][)]', '', row.levels)})"
-
-
 def baseline_curves(file: Path) -> bool:
     """Draw success and return of the baselines in training against steps; return False when there is no curve.
 
@@ -110,7 +104,7 @@ def baseline_curves(file: Path) -> bool:
             for row, points in found:
                 seen = [(p["step"], p[kind][str(d)]) for p in points if str(d) in p[kind]]
                 if seen:
-                    axes.plot(*zip(*seen, strict=True), label=_label(row))
+                    axes.plot(*zip(*seen, strict=True), label=row.label)
             axes.set(ylabel=kind, xlabel="environment steps")
         axes_solved.set_title(f"difficulty {d}")
     handles = {name: h for axes in panels.flat for h, name in zip(*axes.get_legend_handles_labels(), strict=True)}

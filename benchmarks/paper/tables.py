@@ -94,7 +94,8 @@ def baselines() -> str:
     for row in (*BASELINES, *(again for again in AGAIN if points_of(again))):
         paper = "; ".join(filter(None, (row.paper, _SAID.get(row.name))))
         rates = _rates([row.run(d) for d in DIFFICULTIES])
-        rows.append([row.title, row.sees, row.levels, *_cost(points_of(row)), paper, *rates])
+        levels = f"{row.levels} ([how]({row.guide}))" if row.guide else row.levels
+        rows.append([row.title, row.sees, levels, *_cost(points_of(row)), paper, *rates])
     return _table(header, rows)
 
 

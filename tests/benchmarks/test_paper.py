@@ -248,7 +248,6 @@ def test_the_modular_row_has_a_cost_and_no_curve(folder):
     page = results.rebuild(folder).read_text()
     assert "| 1.00 M | 2.0 | 1.0 |" in page and "The curves of agents: not measured yet" in page
     assert not (folder / "baselines.png").exists()
-    assert figures._label(baselines.MODULAR) == "modular (all difficulties, bottom-up)"
 
 
 def test_an_agent_that_was_trained_anew_is_measured_anew(folder, monkeypatch, capsys):
