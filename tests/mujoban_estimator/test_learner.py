@@ -27,8 +27,9 @@ def test_a_learner_fits_what_it_sees_again_and_again(body):
         assert parts[-1]["train/bearings"] < 0.6 * parts[0]["train/bearings"]
 
 
-def test_shards_learn_what_the_whole_batch_teaches():
+def test_shards_learn_what_the_whole_batch_teaches(monkeypatch):
     """Equal streams in two shards give the gradient of one shard, and remember every stream in its row."""
+    monkeypatch.setattr("mujoban_rl.precision.bfloat16_pays", lambda device: False)  # its rounding is 1 in 256
     one = stretch(16, terminated=(8,), completed=(7, 14, 15))
     batches = [Batch._make(np.concatenate([a] * n) for a in next(Batcher([iter([one])], 16, BALL))) for n in (1, 2)]
     learners = [
@@ -37,17 +38,20 @@ def test_shards_learn_what_the_whole_batch_teaches():
         )
         for n in (1, 2)
     ]
+    # Adam would make a step of full length of what rounding alone changes: no second update.
     losses = [
-        [learner.update(batch, 0.0, NaNGuard())["train/loss"] for _ in range(3)]
-        for learner, batch in zip(learners, batches, strict=True)
+        learner.update(batch, 0.0, NaNGuard())["train/loss"] for learner, batch in zip(learners, batches, strict=True)
     ]
-    assert losses[0] == pytest.approx(losses[1], rel=1e-4)
-    # Else Adam's one kernel steps along other weights' gradients.
-    assert all(p.grad.stride() == p.stride() for learner in learners for p in learner.estimator.parameters())
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    parameters = zip(*(learner.estimator.named_parameters() for learner in learners), strict=True)
+    for (name, whole), (_, divided) in parameters:
+        assert torch.linalg.norm(divided.grad - whole.grad) <= 1e-3 * torch.linalg.norm(whole.grad), name
+        # Else Adam's one kernel steps along other weights' gradients.
+        assert all(p.grad.stride() == p.stride() for p in (whole, divided)), name
     whole, divided = (learner.state().tensors["belief.hidden"] for learner in learners)
     assert divided.shape[0] == 2
     for row in divided:
-        np.testing.assert_allclose(row, whole[0], atol=1e-4)
+        np.testing.assert_allclose(row, whole[0], atol=1e-5)
 
 
 def test_an_episode_that_begins_in_a_refused_batch_does_not_go_on_with_the_memory_of_another():
