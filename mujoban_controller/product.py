@@ -9,8 +9,8 @@ from typing import Any, Final, TypeVar
 
 from mujoban_controller.judge import judge
 from mujoban_controller.policy import GoalPolicy
-from mujoban_rl.best import Best
-from mujoban_rl.engine import Learner, Scalars, State
+from mujoban_rl.best import JudgedLearner
+from mujoban_rl.engine import Scalars
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
 from mujoban_sim.oracles import OraclePlanner
@@ -33,7 +33,7 @@ class Validation:
     threads: int = 1
 
 
-class ProductLearner(Learner[BatchT]):
+class ProductLearner(JudgedLearner[BatchT]):
     """A learner whose product is a controller or a teacher.
 
     Late checkpoints differ by more than training improves them, so what is exported is the product that has solved
@@ -42,34 +42,13 @@ class ProductLearner(Learner[BatchT]):
 
     def __init__(self, validation: Validation) -> None:
         """Compare products by `validation`."""
+        super().__init__()
         self._validation = validation
-        self.best = Best()
 
     @property
     @abstractmethod
     def product(self) -> GoalPolicy:
         """The network that the run is for, as it is now."""
-
-    @abstractmethod
-    def own_state(self) -> State:
-        """Return what changes beside modules, optimisers and the best product."""
-
-    @abstractmethod
-    def restore_own(self, state: State) -> None:
-        """Take over what `own_state` returned."""
-
-    def state(self) -> State:
-        """Return what changes beside modules and optimisers."""
-        return State.of({"own": self.own_state(), "best": self.best.state()})
-
-    def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
-        self.restore_own(state.part("own"))
-        self.restore_best(state.part("best"))
-
-    def restore_best(self, state: State) -> None:
-        """Take over the best product and its score."""
-        self.best.restore(state)
 
     def evaluate(self) -> Scalars:
         """Return how many validation levels the product solves under a solver's plans; keep it if it is the best."""
@@ -98,7 +77,5 @@ class ProductLearner(Learner[BatchT]):
         first, 0, of a run that began with an evaluation, training has improved nothing.
         """
         product = self.product
-        chosen = type(product)(**product.config)
-        chosen.load_state_dict(self.best.weights(product))
-        record = {**record, **self.best.told}
-        save_weights(directory.path / f"{product.file_name}.safetensors", chosen, product.config, record)
+        file = directory.path / f"{product.file_name}.safetensors"
+        save_weights(file, self.best.chosen(product), product.config, {**record, **self.best.told})

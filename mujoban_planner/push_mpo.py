@@ -27,8 +27,8 @@ from mujoban_planner.push_run import PushRunConfig, starting_anchor, starting_po
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.validation import success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
-from mujoban_rl.best import Best
-from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
+from mujoban_rl.best import JudgedLearner
+from mujoban_rl.engine import Cadence, Scalars, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
@@ -87,11 +87,12 @@ class PushMPOConfig(PushRunConfig):
         check_shares(self, "discount", "average", "warm_up", "last_rate")
 
 
-class PushMPOLearner(Learner[Window]):
+class PushMPOLearner(JudgedLearner[Window]):
     """Learns from windows of the replay, each under a random symmetry; what solved most held-out levels is exported."""
 
     def __init__(self, config: PushMPOConfig) -> None:
         """Build a policy, or start from a planner's weights."""
+        super().__init__()
         self.config = config
         self.policy = starting_policy(config)
         self._anchor = starting_anchor(config, self.policy)
@@ -101,7 +102,6 @@ class PushMPOLearner(Learner[Window]):
         self._dual_adam = self.mpo.duals.adam(config.dual_learning_rate)
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up, config.last_rate))
         self._rng = np.random.default_rng([config.seed, 8])
-        self.best = Best()
 
     @property
     def target(self) -> PushPolicy:
@@ -118,18 +118,13 @@ class PushMPOLearner(Learner[Window]):
         """Those of the networks and of the dual variables."""
         return {"adam": self._adam, "duals": self._dual_adam}
 
-    def state(self) -> State:
-        """Return the random state and the best planner."""
-        return State.of({"own": State({"rng": self._rng.bit_generator.state}), "best": self.best.state()})
+    def own_state(self) -> State:
+        """Return the random state."""
+        return State({"rng": self._rng.bit_generator.state})
 
-    def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
-        self._rng.bit_generator.state = state.part("own").values["rng"]
-        self.restore_best(state.part("best"))
-
-    def restore_best(self, state: State) -> None:
-        """Take over the best planner and its score."""
-        self.best.restore(state)
+    def restore_own(self, state: State) -> None:
+        """Take over what `own_state` returned."""
+        self._rng.bit_generator.state = state.values["rng"]
 
     def update(self, batch: Window, progress: float, guard: NaNGuard) -> Scalars:
         """Take a step of policy, critic and dual variables."""
@@ -175,9 +170,8 @@ class PushMPOLearner(Learner[Window]):
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the best averaged planner, or the present one where none was judged, with its record."""
         planner = self.target.planner
-        best = self.config.network.build()
-        best.load_state_dict(self.best.weights(planner))
-        save_weights(directory.path / "planner.safetensors", best, planner.config, {**record, **self.best.told})
+        file = directory.path / "planner.safetensors"
+        save_weights(file, self.best.chosen(planner), planner.config, {**record, **self.best.told})
 
 
 def _boards(batch: Window, rows: Tensor, at: Tensor) -> BitBoards:

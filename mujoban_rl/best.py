@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from abc import abstractmethod
+from copy import deepcopy
+from typing import Any, TypeVar
 
 from torch import Tensor, nn
 
-from mujoban_rl.engine import Scalars, State
+from mujoban_rl.engine import Learner, Scalars, State
+
+BatchT = TypeVar("BatchT")
+ProductT = TypeVar("ProductT", bound=nn.Module)
 
 
 class Best:
@@ -34,9 +38,11 @@ class Best:
             self._weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
         self._judged += 1
 
-    def weights(self, product: nn.Module) -> Mapping[str, Tensor]:
-        """Return the best weights, or those of the present product where none was judged."""
-        return self._weights or product.state_dict()
+    def chosen(self, product: ProductT) -> ProductT:
+        """Return a copy of a product, with the best weights where any was judged."""
+        chosen = deepcopy(product)
+        chosen.load_state_dict(self._weights or product.state_dict())
+        return chosen
 
     @property
     def told(self) -> dict[str, Any]:
@@ -55,3 +61,32 @@ class Best:
         self._score = None if score is None else tuple(score)
         self._weights, self._scalars = state.tensors, state.values["scalars"]
         self._at, self._judged = state.values["at"], state.values["evaluations"]
+
+
+class JudgedLearner(Learner[BatchT]):
+    """A learner that exports the best product of its run: its `evaluate` has `best` judge each."""
+
+    def __init__(self) -> None:
+        """Know no best product yet."""
+        self.best = Best()
+
+    @abstractmethod
+    def own_state(self) -> State:
+        """Return what changes beside modules, optimisers and the best product."""
+
+    @abstractmethod
+    def restore_own(self, state: State) -> None:
+        """Take over what `own_state` returned."""
+
+    def state(self) -> State:
+        """Return what changes beside modules and optimisers."""
+        return State.of({"own": self.own_state(), "best": self.best.state()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self.restore_own(state.part("own"))
+        self.restore_best(state.part("best"))
+
+    def restore_best(self, state: State) -> None:
+        """Take over the best product and its score."""
+        self.best.restore(state)

@@ -17,7 +17,7 @@ def test_the_newest_of_the_best_is_kept_with_what_was_found():
     again = Best()
     again.restore(best.state())
     again.judge(product(9.0), (0.0, 1.0), {})
-    assert float(again.weights(product(8.0))["weight"]) == 2.0
+    assert again.chosen(product(8.0)).weight.item() == 2.0
     assert again.told == {"validation": {"rate": 0.7}, "evaluation": 2}
 
 
@@ -25,11 +25,12 @@ def test_what_is_kept_does_not_change_with_the_product():
     best, learned = Best(), product(1.0)
     best.judge(learned, (1.0,), {})
     nn.init.constant_(learned.weight, 2.0)
-    assert float(best.weights(learned)["weight"]) == 1.0
+    chosen = best.chosen(learned)
+    assert chosen.weight.item() == 1.0 and learned.weight.item() == 2.0
 
 
 def test_without_a_judgement_the_present_product_is_the_best():
     best, present = Best(), product(3.0)
     best.restore(best.state())
-    torch.testing.assert_close(dict(best.weights(present)), dict(present.state_dict()))
+    torch.testing.assert_close(dict(best.chosen(present).state_dict()), dict(present.state_dict()))
     assert best.told == {"validation": None, "evaluation": None}
