@@ -19,7 +19,8 @@ from torch.nn import functional
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_planner.teacher import DISCOUNT
 from mujoban_rl.actors import ReplayStore
-from mujoban_rl.engine import Learner, State
+from mujoban_rl.best import JudgedLearner
+from mujoban_rl.engine import State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_discrete import DiscreteMPO, DiscreteMPOConfig, expected_value
@@ -126,7 +127,7 @@ class Answer(Protocol):
         ...
 
 
-class DiscreteMPOLearner(Learner[MPOBatch]):
+class DiscreteMPOLearner(JudgedLearner[MPOBatch]):
     """Online and target network, and the dual variables."""
 
     network: nn.Module
@@ -135,6 +136,7 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
 
     def __init__(self, config: MPOSettings, network: nn.Module, device: torch.device | str = "cpu") -> None:
         """Train `network` in place."""
+        super().__init__()
         self.config, self.device = config, torch.device(device)
         self.network = network.to(self.device).train()
         self.target = copy.deepcopy(self.network).eval()
@@ -153,12 +155,12 @@ class DiscreteMPOLearner(Learner[MPOBatch]):
         """Those of the network and of the dual variables."""
         return {"adam": self._adam, "duals": self._dual_adam}
 
-    def state(self) -> State:
+    def own_state(self) -> State:
         """Return the number of updates, by which the target network follows."""
         return State({"updates": self._updates})
 
-    def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
+    def restore_own(self, state: State) -> None:
+        """Take over what `own_state` returned."""
         self._updates = state.values["updates"]
 
     def update(self, batch: MPOBatch, progress: float, guard: NaNGuard) -> dict[str, float]:

@@ -175,14 +175,19 @@ class ExplorerLearner(DiscreteMPOLearner):
         return super().value(answer).clamp(min=0.0)
 
     def evaluate(self) -> dict[str, float]:
-        """Return what the target network gets to see of validation levels, and what the scripted scout does."""
+        """Return what the target network gets to see of validation levels, and what the scripted scout does.
+
+        It is kept if none has earned more.
+        """
         scouts = self.target, ScriptedScout(self._body)
         learned, scripted = (judge_scout(scout, self._reward, _JUDGED, self._body) for scout in scouts)
+        self.best.judge(self.target, (learned["reward"],), learned)
         return learned | {f"scripted/{name}": value for name, value in scripted.items()}
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the target network with its record."""
-        save_weights(directory.path / "explorer.safetensors", self.target, self.target.config, record)
+        """Write the target network that has earned most, or the present one, with its record."""
+        file, target = directory.path / "explorer.safetensors", self.target
+        save_weights(file, self.best.chosen(target), target.config, {**record, **self.best.told})
 
 
 def explore(

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,16 +20,17 @@ from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import beginning
 from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
 from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.product import PlannerLearner
 from mujoban_planner.samples import Batch
 from mujoban_planner.teacher import HOPELESS
-from mujoban_planner.validation import NetworkConfig, success_rates
+from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions
-from mujoban_rl.engine import Budget, Cadence, Learner, Source, State, Trainer
+from mujoban_rl.engine import Budget, Cadence, Source, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import lineage, origin, provenance, save_weights, usable_device
+from mujoban_rl.weights import lineage, origin, provenance, usable_device
 
 _CLIP = 1.0
 """Largest norm of the gradient."""
@@ -138,11 +138,12 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> t
     return loss, {k: v.detach() for k, v in parts.items()}
 
 
-class ImitationLearner(Learner[Batch]):
+class ImitationLearner(PlannerLearner[Batch]):
     """Trains a network on lessons; the moving average of its weights is what is played and shipped."""
 
     def __init__(self, config: LearnerConfig, device: torch.device | str = "cpu") -> None:
         """Make the network."""
+        super().__init__()
         self.config, self.device = config, usable_device(device)
         torch.manual_seed(config.seed)  # the initial weights
         self.network = beginning(config, config.init).to(self.device)
@@ -154,7 +155,7 @@ class ImitationLearner(Learner[Batch]):
         self._updates = 0
 
     @property
-    def average(self) -> LearnedPlanner:
+    def product(self) -> LearnedPlanner:
         """The moving average."""
         return self._average.module
 
@@ -168,12 +169,12 @@ class ImitationLearner(Learner[Batch]):
         """One."""
         return {"adamw": self.optimiser}
 
-    def state(self) -> State:
+    def own_state(self) -> State:
         """Return the number of updates."""
         return State({"updates": self._updates})
 
-    def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
+    def restore_own(self, state: State) -> None:
+        """Take over what `own_state` returned."""
         self._updates = state.values["updates"]
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> dict[str, float]:
@@ -191,15 +192,7 @@ class ImitationLearner(Learner[Batch]):
 
     def weights(self) -> Mapping[str, Tensor]:
         """Return the average, whose play is corrected."""
-        return self.average.state_dict()
-
-    def evaluate(self) -> dict[str, float]:
-        """Return solve rates of the average on held-out levels."""
-        return success_rates(self.average)
-
-    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the average with its record."""
-        save_weights(directory.path / "planner.safetensors", self.average, self.average.config, record)
+        return self.product.state_dict()
 
 
 def imitation(

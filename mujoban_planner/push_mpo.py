@@ -21,13 +21,13 @@ from torch.nn import functional
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards, signed
+from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.product import PlannerLearner
 from mujoban_planner.push_actor import BOARDS, STEP, PlayConfig, PushActor
 from mujoban_planner.push_policy import PushPolicy, images
 from mujoban_planner.push_run import PushRunConfig, starting_anchor, starting_policy, training_record
 from mujoban_planner.symmetry import SYMMETRIES
-from mujoban_planner.validation import success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
-from mujoban_rl.best import JudgedLearner
 from mujoban_rl.engine import Cadence, Scalars, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo import scalars
@@ -37,7 +37,6 @@ from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, 
 from mujoban_rl.precision import autocast
 from mujoban_rl.replay import SequenceBuilder, SequenceReplay
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import save_weights
 
 _KEPT: Final = (*BOARDS, *STEP)
 """What is kept of a step."""
@@ -87,7 +86,7 @@ class PushMPOConfig(PushRunConfig):
         check_shares(self, "discount", "average", "warm_up", "last_rate")
 
 
-class PushMPOLearner(JudgedLearner[Window]):
+class PushMPOLearner(PlannerLearner[Window]):
     """Learns from windows of the replay, each under a random symmetry; what solved most held-out levels is exported."""
 
     def __init__(self, config: PushMPOConfig) -> None:
@@ -107,6 +106,11 @@ class PushMPOLearner(JudgedLearner[Window]):
     def target(self) -> PushPolicy:
         """The averaged policy with its critic."""
         return self._average.module
+
+    @property
+    def product(self) -> LearnedPlanner:
+        """The averaged planner."""
+        return self.target.planner
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -159,19 +163,6 @@ class PushMPOLearner(JudgedLearner[Window]):
     def weights(self) -> Mapping[str, Tensor]:
         """Return the policy's weights."""
         return self.policy.state_dict()
-
-    def evaluate(self) -> Scalars:
-        """Return the averaged planner's solve rates, alone, on held-out levels; keep it if it is the best."""
-        planner = self.target.planner
-        rates = success_rates(planner)
-        self.best.judge(planner, tuple(rates.values()), rates)
-        return rates
-
-    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the best averaged planner, or the present one where none was judged, with its record."""
-        planner = self.target.planner
-        file = directory.path / "planner.safetensors"
-        save_weights(file, self.best.chosen(planner), planner.config, {**record, **self.best.told})
 
 
 def _boards(batch: Window, rows: Tensor, at: Tensor) -> BitBoards:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -18,17 +18,17 @@ from torch.distributions import Categorical
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards
+from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.product import PlannerLearner
 from mujoban_planner.push_actor import BOARDS, STEP, PlayConfig, PushActor
 from mujoban_planner.push_run import PushRunConfig, starting_anchor, starting_policy, training_record
-from mujoban_planner.validation import success_rates
 from mujoban_rl.actors import ActorOptions, ActorSource, Arrays, Rollouts
-from mujoban_rl.engine import Cadence, Learner, Scalars, State, Trainer
+from mujoban_rl.engine import Cadence, Scalars, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.ppo import PPOConfig, generalised_advantages, ppo_loss
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_cosine
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import save_weights
 
 PPO_PACE: Final = {"publish_updates": 1}
 """How often a run publishes: each rollout is to be played by the newest policy."""
@@ -62,17 +62,23 @@ class PushPPOConfig(PushRunConfig):
         check_shares(self, "discount", "decay", "warm_up")
 
 
-class PushPPOLearner(Learner[Arrays]):
+class PushPPOLearner(PlannerLearner[Arrays]):
     """Learns from the rollouts of `PushActor`."""
 
     def __init__(self, config: PushPPOConfig) -> None:
         """Build a policy, or start from a planner's weights."""
+        super().__init__()
         self.config = config
         self.policy = starting_policy(config)
         self._anchor = starting_anchor(config, self.policy)
         self._adam = torch.optim.Adam(self.policy.parameters(), config.learning_rate, eps=1e-5, fused=True)
         self._schedule = ProgressSchedule(self._adam, warm_up_cosine(config.warm_up))
         self._rng = np.random.default_rng([config.seed, 7])
+
+    @property
+    def product(self) -> LearnedPlanner:
+        """The planner."""
+        return self.policy.planner
 
     @property
     def modules(self) -> Mapping[str, torch.nn.Module]:
@@ -84,11 +90,11 @@ class PushPPOLearner(Learner[Arrays]):
         """Adam."""
         return {"adam": self._adam}
 
-    def state(self) -> State:
+    def own_state(self) -> State:
         """Return the random state."""
         return State({"rng": self._rng.bit_generator.state})
 
-    def restore(self, state: State) -> None:
+    def restore_own(self, state: State) -> None:
         """Take over the random state."""
         self._rng.bit_generator.state = state.values["rng"]
 
@@ -139,18 +145,6 @@ class PushPPOLearner(Learner[Arrays]):
     def weights(self) -> Mapping[str, Tensor]:
         """Return the policy's weights."""
         return self.policy.state_dict()
-
-    def evaluate(self) -> Scalars:
-        """Return the planner's solve rates, alone, on held-out levels."""
-        planner = self.policy.planner.eval()
-        rates = success_rates(planner)
-        planner.train()
-        return rates
-
-    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the planner's weights with their record."""
-        planner = self.policy.planner
-        save_weights(directory.path / "planner.safetensors", planner, planner.config, record)
 
 
 def push_ppo(

@@ -8,11 +8,11 @@ Shapes: B batch, N = `grid.GRID_SIZE`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import torch
 
@@ -27,11 +27,12 @@ from mujoban_planner.heads import silence_verdicts
 from mujoban_planner.move_learner import MoveLearner
 from mujoban_planner.moves import MoveActor, PlayConfig
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_planner.validation import NetworkConfig, success_rates
+from mujoban_planner.product import PlannerLearner
+from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Source, State, Trainer
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import lineage, provenance, save_weights
+from mujoban_rl.weights import lineage, provenance
 
 MPO_PACE: Final = {"log_updates": 50, "publish_updates": 5}
 """How often a run logs and publishes."""
@@ -113,7 +114,7 @@ class RecordedMoves(Source[MPOBatch]):
         self._generator.set_state(state.tensors["generator"])
 
 
-class MPOLearner(MoveLearner):
+class MPOLearner(PlannerLearner[MPOBatch], MoveLearner):
     """A planner that learns over moves."""
 
     def __init__(
@@ -131,13 +132,10 @@ class MPOLearner(MoveLearner):
             critic_first=config.critic_first,
         )  # fmt: skip
 
-    def evaluate(self) -> dict[str, float]:
-        """Return solve rates of the target network on held-out levels."""
-        return success_rates(self.target)
-
-    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the target network with its record."""
-        save_weights(directory.path / "planner.safetensors", self.target, self.target.config, record)
+    @property
+    def product(self) -> LearnedPlanner:
+        """The target network."""
+        return self.target
 
 
 def reinforcement(

@@ -1,4 +1,8 @@
-"""Several methods one after the other, each from the weights of the one before: `... mujoban_planner.train stages`."""
+"""Several methods one after the other, each from the weights of the one before: `... mujoban_planner.train stages`.
+
+What ends up as their planner is the best of all stages on held-out levels: each keeps what it begins with until it has
+made something better.
+"""
 
 from __future__ import annotations
 
@@ -152,7 +156,7 @@ def train_stages(
 
     Args:
         config: What to train; fixed for the run.
-        directory: Run directory; the planner of the last stage is copied there.
+        directory: Run directory; the planner of the last stage, the best of all, is copied there.
         cadence: How often stages evaluate and save.
         actors: Where levels are searched or played, and lessons made.
         seconds: Wall-clock of this bit of the run.
@@ -171,7 +175,9 @@ def train_stages(
         folders.append(directory / f"{i}_{method}")
         seed = len(config.parsed) * config.seed + i - 1  # each stage has levels of its own
         settings = _Settings(config.network, init, seed, share * config.cpu_seconds)
-        trainer = METHODS[method](settings, _Place(folders[-1], cadence, actors, device))
+        # What it begins with counts as a product: a stage that only makes it worse leaves it as it is.
+        judging = replace(cadence, evaluate_first=cadence.evaluate_first or init is not None)
+        trainer = METHODS[method](settings, _Place(folders[-1], judging, actors, device))
         product = folders[-1] / _PRODUCT
         if trainer.complete and product.exists():
             trainer.source.close()

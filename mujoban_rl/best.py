@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from copy import deepcopy
 from typing import Any, TypeVar
 
@@ -70,11 +69,10 @@ class JudgedLearner(Learner[BatchT]):
         """Know no best product yet."""
         self.best = Best()
 
-    @abstractmethod
     def own_state(self) -> State:
-        """Return what changes beside modules, optimisers and the best product."""
+        """Return what changes beside modules, optimisers and the best product; nothing by default."""
+        return State()
 
-    @abstractmethod
     def restore_own(self, state: State) -> None:
         """Take over what `own_state` returned."""
 

@@ -22,7 +22,7 @@ from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence, Trainer
 from mujoban_rl.run_directory import RunError
-from mujoban_rl.weights import WeightsError, save_weights
+from mujoban_rl.weights import WeightsError, read_record, save_weights
 
 PLAY = PlayConfig(environments=8, steps=4)
 CONFIG = StagesConfig(stages=("ppo=1", "mpo-pushes=3"), cpu_seconds=8e9, channels=8, blocks=1, seed=3)
@@ -65,6 +65,28 @@ def test_each_stage_begins_with_the_planner_of_the_one_before(tmp_path: Path, st
         assert record[cost] == sum(stage[cost] for stage in record["stages"]) > max(s[cost] for s in record["stages"])
 
 
+def test_a_stage_that_only_makes_its_planner_worse_leaves_it_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: list[Any]
+) -> None:
+    def judged(method: Any) -> Any:
+        def make(settings: Any, place: Any) -> Trainer[Any]:
+            trainer = method(settings, place)
+            del trainer.learner.evaluate
+            return trainer
+
+        return make
+
+    monkeypatch.setattr(stages, "METHODS", {name: judged(method) for name, method in stages.METHODS.items()})
+    rates = iter([0.5, 0.5, 0.2])  # the first stage's, what the second begins with, what that makes of it
+    monkeypatch.setattr("mujoban_planner.product.success_rates", lambda planner: {"success_rate/5": next(rates)})
+    assert train_stages(CONFIG, tmp_path, OFTEN, ActorOptions())
+    first = load(tmp_path / "1_ppo" / "planner.safetensors", compiled=False).state_dict()
+    shipped = load(tmp_path / "planner.safetensors", compiled=False).state_dict()
+    assert all(torch.equal(values, shipped[name]) for name, values in first.items())
+    record = json.loads((tmp_path / "planner.json").read_text())
+    assert record["validation"] == {"success_rate/5": 0.5} and record["evaluation"] == 0
+
+
 def test_weights_that_a_solver_has_taught_are_not_recorded_as_without_one(tmp_path: Path) -> None:
     network = NetworkConfig(channels=8, blocks=1).build()
     taught = tmp_path / "taught.safetensors"
@@ -91,6 +113,30 @@ def small_planner(path: Path, *, blocks: int = 2) -> Path:
         torch.nn.init.normal_(parameter, 0.0, 0.1)
     save_weights(path, network, network.config, {"data": "a test"})
     return path
+
+
+@pytest.mark.parametrize("method", sorted(stages.METHODS))
+def test_every_method_exports_the_planner_that_solved_most_held_out_levels(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def make() -> Trainer[Any]:
+        settings = stages._Settings(NetworkConfig(channels=8, blocks=1), None, seed=0, cpu_seconds=1e9)
+        return stages.METHODS[method](settings, stages._Place(tmp_path, OFTEN, ActorOptions(), "cpu"))
+
+    rates = [{"success_rate/5": 0.5, "success_rate/4": 0.7}, {"success_rate/5": 0.4, "success_rate/4": 0.9}]
+    found = iter(rates)
+    monkeypatch.setattr("mujoban_planner.product.success_rates", lambda planner: next(found))
+    trainer = make()
+    for value in (1.0, 2.0):
+        trainer.learner.product.encoder.weight.data.fill_(value)
+        trainer.learner.evaluate()
+    trainer.save()
+    resumed = make()
+    resumed.learner.export(resumed.directory, {})
+    file = tmp_path / "planner.safetensors"
+    assert float(load(file, compiled=False).encoder.weight.detach().max()) == 1.0
+    record = read_record(file)
+    assert (record["validation"], record["evaluation"]) == (rates[0], 0)
 
 
 @pytest.mark.parametrize("method", sorted(stages.METHODS))

@@ -156,7 +156,7 @@ def test_mpo_that_is_terminated_and_resumed_equals_one_that_never_stopped(tmp_pa
 def test_mpo_refuses_a_batch_with_nan(tmp_path):
     trainer = _mpo(tmp_path)
     check_refusal(trainer, lambda batch: batch._replace(reward=batch.reward * math.nan))
-    assert trainer.learner.state().values == {"updates": 2}, "the refused batch counts as none of the three"
+    assert trainer.learner.own_state().values == {"updates": 2}, "the refused batch counts as none of the three"
 
 
 @pytest.mark.parametrize("propagation", [True, False])

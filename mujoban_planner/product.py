@@ -1,0 +1,40 @@
+"""What the learners of all methods have in common: a planner that is judged on whole levels, and the best one kept."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.validation import success_rates
+from mujoban_rl.best import JudgedLearner
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.weights import save_weights
+
+BatchT = TypeVar("BatchT")
+
+
+class PlannerLearner(JudgedLearner[BatchT]):
+    """A learner whose product is a planner: what solves the most held-out levels, alone, is exported."""
+
+    @property
+    @abstractmethod
+    def product(self) -> LearnedPlanner:
+        """The planner that the run is for, as it is now."""
+
+    def evaluate(self) -> dict[str, float]:
+        """Return the planner's solve rates, alone, on held-out levels; keep it if it is the best."""
+        product = self.product
+        training = product.training
+        product.eval()
+        rates = success_rates(product)
+        product.train(training)
+        self.best.judge(product, tuple(rates.values()), rates)
+        return rates
+
+    def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
+        """Write the best planner, or the present one where none was judged, with its record."""
+        product = self.product
+        file = directory.path / "planner.safetensors"
+        save_weights(file, self.best.chosen(product), product.config, {**record, **self.best.told})
