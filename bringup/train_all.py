@@ -45,6 +45,7 @@ WEIGHTS: Final = {
 PRODUCTS: Final = {
     **WEIGHTS,
     "teacher": "teacher/teacher.safetensors",
+    "critic": "teacher/critic.safetensors",
     "student": "controller_distil/controller.safetensors",
     "whole": "planner/planner.safetensors",
     "first": "bags_first",
@@ -52,8 +53,6 @@ PRODUCTS: Final = {
 }
 """And all that another stage needs: the teacher, its student, the planner of boards in full view, the bags."""
 _BAGS: Final = ("first", "second")
-_CRITIC: Final = "teacher/critic.safetensors"
-"""The teacher's, with which MPO of its student begins."""
 SHARES: Final = {
     "teacher": 0.09,
     "controller_distil": 0.31,
@@ -204,7 +203,7 @@ def _trainer(
 
 
 def _controller(options: Options) -> list[Stage]:
-    run, teacher, student = options.run, PRODUCTS["teacher"], PRODUCTS["student"]
+    run, (teacher, critic, student) = options.run, (PRODUCTS[n] for n in ("teacher", "critic", "student"))
     common = ("--seed", str(options.seed), "--task.world", options.physics.world)
     common += ("--task.body", options.physics.body)
     judged = max(4, min(64, round(_JUDGED_PER_HOUR * options.hours)))
@@ -217,8 +216,8 @@ def _controller(options: Options) -> list[Stage]:
     return [
         _trainer(
             options, "teacher", (train, "--stage", "teacher", "--algorithm", "mpo", *common,
-            *turning, *_from_before(options, "--initial", "teacher")), teacher, beside=(_CRITIC,),
-            sources=_sources(options, "teacher"),
+            *turning, *_from_before(options, "--initial", "teacher"), *_from_before(options, "--critic", "critic")),
+            teacher, beside=(critic,), sources=_sources(options, "teacher", "critic"),
         ),
         _trainer(
             options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common,
@@ -227,8 +226,7 @@ def _controller(options: Options) -> list[Stage]:
         ),
         _trainer(
             options, "controller_mpo",
-            (train, "--stage", "mpo", "--initial", str(run / student), "--critic", str(run / _CRITIC), *common,
-            *look),
+            (train, "--stage", "mpo", "--initial", str(run / student), "--critic", str(run / critic), *common, *look),
             WEIGHTS["controller"], "teacher", "controller_distil",
         ),
     ]  # fmt: skip

@@ -66,8 +66,8 @@ def test_a_continued_run_takes_every_module_from_the_one_before(tmp_path: Path) 
     before = finished(tmp_path / "before")
     found = commands(Options(run=tmp_path / "run", before=before))
     for name, option, product in (
-        ("teacher", "--initial", "teacher"), ("controller_distil", "--initial", "controller"),
-        ("planner", "--init", "whole"),
+        ("teacher", "--initial", "teacher"), ("teacher", "--critic", "critic"),
+        ("controller_distil", "--initial", "controller"), ("planner", "--init", "whole"),
     ):  # fmt: skip
         assert found[name][found[name].index(option) + 1] == str(before / PRODUCTS[product])
     first = found["estimator_first"]
