@@ -93,10 +93,13 @@ _STUDENT: Final = (
 )  # fmt: skip
 """The student sees more of instructions that failed before, and of STAYs, which the stack asks for often; what it is to
 do under pushes that are not possible weighs less, so that it tries those where it can't tell."""
-_TURNING: Final = (
+_TEACHER: Final = ("--algorithm", "mpo")
+_TURNING_TEACHER: Final = (
+    "--algorithm", "ppo", "--task.planned", "0.7", "--task.retry", "0.25",
     "--task.instructions.stay", "0.2", "--task.instructions.stays-on", "0.985", "--task.reward.heading", "0.15",
 )  # fmt: skip
-"""For a teacher whose body no single action turns: it is told to stay, where it turns, often enough to learn to."""
+"""Of a body that no single action turns: it is told to stay, where it turns, often enough to learn to. PPO is what has
+taught such a body (docs/research/controller.md); it leaves no critic for the student's MPO to begin with."""
 _SENSES: Final = ("--learner.slip", "0.015", "--learner.lost", "0.05")
 """How far the odometer is off in training of estimator and termination."""
 _VIEWS: Final = ("--noise", "0.1", "--hidden", "0.3")
@@ -136,10 +139,16 @@ class Options:
             raise ValueError(f"--hours {self.hours}: expected a positive number")
         if not 0 <= self.seed <= _LAST_SEED:
             raise ValueError(f"--seed {self.seed}: expected a whole number from 0 to {_LAST_SEED}")
-        needed = (path for name, path in PRODUCTS.items() if name not in _BAGS)
+        spared = _BAGS if self.has_critic else (*_BAGS, "critic")
+        needed = (path for name, path in PRODUCTS.items() if name not in spared)
         missing = [] if self.before is None else [path for path in needed if not (self.before / path).exists()]
         if missing:
             raise ValueError(f"--continue {self.before}: lacks {missing[0]}, expected the directory of a finished run")
+
+    @property
+    def has_critic(self) -> bool:
+        """Whether the teacher leaves a critic beside it: whether it learns by MPO."""
+        return get_body(self.physics.body).turn is not None
 
     @property
     def machine(self) -> Machine:
@@ -203,21 +212,23 @@ def _trainer(
 
 
 def _controller(options: Options) -> list[Stage]:
-    run, (teacher, critic, student) = options.run, (PRODUCTS[n] for n in ("teacher", "critic", "student"))
+    run, teacher, student = options.run, PRODUCTS["teacher"], PRODUCTS["student"]
     common = ("--seed", str(options.seed), "--task.world", options.physics.world)
     common += ("--task.body", options.physics.body)
     judged = max(4, min(64, round(_JUDGED_PER_HOUR * options.hours)))
     every = round(min(max(1.0, options.hours), 4.0) * _EVALUATED_STEPS)
     common += ("--steps", str(_STEPS), "--evaluate-every", str(every), "--evaluation-episodes", str(judged))
     train, body = "mujoban_controller.train", get_body(options.physics.body)
-    turning = _TURNING if body.turn is None else ()
+    method = _TEACHER if options.has_critic else _TURNING_TEACHER
+    made = {"--initial": "teacher"} | ({"--critic": "critic"} if options.has_critic else {})
+    begun = [x for option, product in made.items() for x in _from_before(options, option, product)]
+    taught = ("--critic", str(run / PRODUCTS["critic"])) if options.has_critic else ()
     # Who finds the heading by sight looks around first, as in the stack.
     look = ("--task.look", str(body.seeking_ticks)) if body.seeking_ticks else ()
     return [
         _trainer(
-            options, "teacher", (train, "--stage", "teacher", "--algorithm", "mpo", *common,
-            *turning, *_from_before(options, "--initial", "teacher"), *_from_before(options, "--critic", "critic")),
-            teacher, beside=(critic,), sources=_sources(options, "teacher", "critic"),
+            options, "teacher", (train, "--stage", "teacher", *common, *method, *begun), teacher,
+            beside=[PRODUCTS[product] for product in [*made.values()][1:]], sources=_sources(options, *made.values()),
         ),
         _trainer(
             options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common,
@@ -226,7 +237,7 @@ def _controller(options: Options) -> list[Stage]:
         ),
         _trainer(
             options, "controller_mpo",
-            (train, "--stage", "mpo", "--initial", str(run / student), "--critic", str(run / critic), *common, *look),
+            (train, "--stage", "mpo", "--initial", str(run / student), *taught, *common, *look),
             WEIGHTS["controller"], "teacher", "controller_distil",
         ),
     ]  # fmt: skip

@@ -140,6 +140,18 @@ def test_a_body_that_finds_its_heading_by_sight_looks_around_before_it_learns(tm
     assert "--task.instructions.stay" in ant["teacher"] and "--task.instructions.stay" not in ball["teacher"]
 
 
+def test_a_body_that_no_single_action_turns_has_a_teacher_by_ppo_and_no_critic(tmp_path: Path) -> None:
+    before, run, ant = finished(tmp_path / "before"), tmp_path / "run", WorldOptions("ant")
+    (before / PRODUCTS["critic"]).unlink()
+    found = {stage.name: stage for stage in stages(Options(run=run, before=before, physics=ant))}
+    teacher, student = found["teacher"], found["controller_mpo"]
+    assert teacher.command[teacher.command.index("--algorithm") + 1] == "ppo"
+    assert teacher.products == (run / PRODUCTS["teacher"],)
+    assert "--critic" not in teacher.command and "--critic" not in student.command
+    with pytest.raises(ValueError, match=r"lacks teacher/critic\.safetensors"):
+        Options(run=run, before=before)
+
+
 @pytest.mark.parametrize("name", EVALUATIONS)
 def test_an_evaluation_plays_levels_by_which_nothing_is_chosen(tmp_path: Path, name: str) -> None:
     command = commands(Options(run=tmp_path))[name]
