@@ -20,8 +20,7 @@ from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.interfaces import Memory
-from mujoban_core.ranges import check_counts
-from mujoban_rl.exploration import Exploration, check_exploration
+from mujoban_rl.exploration import Exploration
 from mujoban_rl.networks import frame_encoder, rows_of_sky
 
 
@@ -69,12 +68,8 @@ class MonolithicAgent(RecurrentAgent):
             raise ValueError(f"size {size!r}: expected one of {', '.join(SIZES)}")
         chosen = SIZES[size]
         super().__init__(body, chosen.features, chosen.hidden, [chosen.features] * (1 + chosen.extra))
-        self.repeat, self.draws = repeat, draws
-        check_counts(self, "repeat")
-        self.config |= {"size": size, "repeat": repeat}
-        if draws is not None:
-            check_exploration(draws)
-            self.config["draws"] = draws
+        self.config["size"] = size
+        self.play_by(repeat, draws)
         # What lies above the horizon shows the heading, which is in o_pos.
         self.first_row = rows_of_sky(get_body(body).camera, 2 ** (len(chosen.channels) - 1))
         self.encoder = frame_encoder(chosen.channels, chosen.features, FRAME_SIZE - self.first_row)
@@ -103,9 +98,22 @@ class TopDownAgent(RecurrentAgent):
 
     sees: tuple[str, ...] = ("top_down", "proprio")
 
-    def __init__(self, body: str = "ball", embedded: int = _VIEW + _FELT) -> None:
-        """Build the network; `embedded` counts the features of everything that is seen."""
+    def __init__(
+        self, body: str = "ball", repeat: int = 1, draws: Exploration | None = None, *, embedded: int = _VIEW + _FELT
+    ) -> None:
+        """Build the network.
+
+        Args:
+            body: Key in `mujoban_core.bodies.BODIES`.
+            repeat: Ticks for which its torques are to be held.
+            draws: Noise by which they are to be drawn in play; None: their means are played.
+            embedded: Features of everything that is seen.
+
+        Raises:
+            ValueError: If body or noise are unknown, or torques held for no tick.
+        """
         super().__init__(body, embedded, _HIDDEN, [_VIEW])
+        self.play_by(repeat, draws)
         self.encoder = view_encoder(_VIEW)
         self.body_sense = BodySense(body, pose=False)
         self.body_encoder = dense(self.body_sense.size, _FELT)
@@ -130,9 +138,9 @@ class StructuredAgent(TopDownAgent):
 
     sees = ("top_down", "proprio", "abstract_state")
 
-    def __init__(self, body: str = "ball") -> None:
-        """Build the network."""
-        super().__init__(body, 2 * _VIEW + _FELT)
+    def __init__(self, body: str = "ball", repeat: int = 1, draws: Exploration | None = None) -> None:
+        """Build the network; arguments and errors are those of `TopDownAgent`."""
+        super().__init__(body, repeat, draws, embedded=2 * _VIEW + _FELT)
         cells = GRID_SIZE * GRID_SIZE
         self.map_encoder = nn.Sequential(
             nn.Conv2d(2 * len(CHANNELS), 32, 3, padding=1), nn.ReLU(), nn.Conv2d(32, 16, 3, padding=1), nn.ReLU(),
@@ -159,7 +167,7 @@ class StructuredAgent(TopDownAgent):
         sights, memory, others = super().look(inputs, state)
         subgoals = Subgoals(*others).renewed(inputs.abstract_state)
         seen = {**sights, "abstract_state": inputs.abstract_state > 0.5, "subgoal": subgoals.target}
-        return seen, memory, tuple(subgoals.aged())
+        return seen, memory, tuple(subgoals.aged(self.repeat))
 
 
 AGENTS: Final[dict[str, Any]] = {cls.__name__: cls for cls in (MonolithicAgent, TopDownAgent, StructuredAgent)}

@@ -1,6 +1,6 @@
 """V-trace (paper D.2) on the unrolls of actors: the overall reward, and the pseudo reward of subgoals where there are.
 
-Shape legend: T steps of an unroll, which holds T + 1 ticks, B robots.
+Shape legend: T steps of an unroll, which holds T + 1 ticks, B robots. A tick is one in which the agent decides.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class VTraceTrainingConfig:
     """Settings of V-trace; those of its loss are IMPALA's."""
 
     unroll: int = 20
-    """T."""
+    """T, in decisions of the agent."""
     gamma: float = 0.99
     rate: float = 3e-4
     """Learning rate; it falls to 0 along a line."""
@@ -45,7 +45,8 @@ class VTraceTrainingConfig:
     normalised: int = 500
     """Updates after which the normalisation of proprioception stays as it is."""
     exploration: Exploration = "white"
-    """How alike the noise of successive ticks is."""
+    """How alike the noise of successive ticks is. What is noted of a draw is its probability alone, given no other:
+    with pink noise learning is on-policy only approximately."""
     loss: VTraceConfig = field(default_factory=VTraceConfig)
 
     def __post_init__(self) -> None:

@@ -19,7 +19,8 @@ from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import GRID_SIZE
 from mujoban_core.interfaces import Memory
-from mujoban_rl.exploration import Exploration
+from mujoban_core.ranges import check_counts
+from mujoban_rl.exploration import Exploration, check_exploration
 from mujoban_rl.networks import Gaussian, Normaliser, PreActivatedBlock, encode_frames, gaussian, gaussian_layers
 
 Sights = Mapping[str, NDArray[Any]]
@@ -120,6 +121,23 @@ class RecurrentAgent(nn.Module, Agent):
         self.lstm = nn.LSTMCell(embedded, hidden)
         self.trunk = dense(hidden + embedded, *trunk)
         self.mean, self.scale = gaussian_layers(self.width, self.action_size)
+
+    def play_by(self, repeat: int, draws: Exploration | None) -> None:
+        """Say how whoever plays is to hold and draw torques; weights remember it, if the class takes both by name.
+
+        Args:
+            repeat: Ticks for which a torque is held.
+            draws: Noise by which torques are drawn; None: their means are played.
+
+        Raises:
+            ValueError: If torques are held for no tick, or there is no such noise.
+        """
+        self.repeat, self.draws = repeat, draws
+        check_counts(self, "repeat")
+        self.config["repeat"] = repeat
+        if draws is not None:
+            check_exploration(draws)
+            self.config["draws"] = draws
 
     @property
     def reads(self) -> tuple[str, ...]:

@@ -60,9 +60,9 @@ class Subgoals(NamedTuple):
         drawn[due] += 1
         return Subgoals(target, age, self.seed, drawn)
 
-    def aged(self) -> Subgoals:
-        """Return them after one more step."""
-        return self._replace(age=self.age + 1)
+    def aged(self, steps: int = 1) -> Subgoals:
+        """Return them after so many more steps."""
+        return self._replace(age=self.age + steps)
 
 
 def adjacent_state(state: NDArray[np.bool_], draw: float) -> NDArray[np.bool_]:

@@ -33,6 +33,7 @@ from mujoban_baselines.impala import VTraceLearner, VTraceTrainingConfig
 from mujoban_baselines.joint.learner import joint_parts
 from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.mpo import MPOLearner, MPOTrainingConfig, WindowStore
+from mujoban_baselines.networks import RecurrentAgent
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_core.bodies import get_body
 from mujoban_core.program import read_options, run_command
@@ -84,16 +85,28 @@ class PlayConfig(RunConfig):
 
 
 @dataclass(frozen=True)
-class MPORunConfig(PlayConfig):
+class AgentRunConfig(PlayConfig):
+    """A run of an agent that says torques itself."""
+
+    repeat: int = 1
+    """Ticks for which each torque is held, in play as well (action repeat); returns, and windows, unrolls and the
+    replay count decisions."""
+    draws: Exploration | None = None
+    """Noise by which its torques are drawn in play, too, such as that by which it explores; None: their means."""
+
+    @property
+    def play(self) -> dict[str, Any]:
+        """What an agent's class is to be told of both; nothing of what holds for every agent."""
+        told = {"repeat": self.repeat, "draws": self.draws}
+        return {name: value for name, value in told.items() if value != getattr(RecurrentAgent, name)}
+
+
+@dataclass(frozen=True)
+class MPORunConfig(AgentRunConfig):
     """A run of monolithic MPO."""
 
     size: Size = "S"
     """Variant of the network."""
-    repeat: int = 1
-    """Ticks for which each torque is held, in play as well (action repeat); returns, windows and the replay count
-    decisions."""
-    draws: Exploration | None = None
-    """Noise by which its torques are drawn in play, too, such as that by which it explores; None: their means."""
     critic: Literal["asymmetric", "symmetric"] = "asymmetric"
     """What the critic sees: the simulator's truth, or what the agent sees, on one torso."""
     start: Path | None = None
@@ -102,7 +115,7 @@ class MPORunConfig(PlayConfig):
 
 
 @dataclass(frozen=True)
-class VTraceRunConfig(PlayConfig):
+class VTraceRunConfig(AgentRunConfig):
     """A run of V-trace."""
 
     task: Annotated[TaskConfig, tyro.conf.arg(name="")] = field(
@@ -149,7 +162,7 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
     torch.manual_seed(config.seed)  # the initial weights
     body, mpo = config.task.body, config.mpo
     if config.start is None:
-        agent = MonolithicAgent(body, config.size, config.repeat, config.draws)
+        agent = MonolithicAgent(body, config.size, **config.play)
     else:
         agent = load_weights(MonolithicAgent, config.start, body=body).train()
         for name in ("size", "repeat", "draws"):
@@ -172,7 +185,7 @@ def vtrace_parts(
 ) -> Parts:
     """Return learner and source of V-trace with an agent of a kind (paper D.2)."""
     torch.manual_seed(config.seed)  # the initial weights
-    unroll, build = config.vtrace, partial(kind, config.task.body)
+    unroll, build = config.vtrace, partial(kind, config.task.body, **config.play)
     plays = task or partial(MujobanTask, config.task)
     factory = partial(make_actor, plays, build, unroll.length, 1, (), unroll.exploration, config.seed)
     source = ActorSource(actors.pool(factory), Rollouts(axis=1, count=actors.num_actors))

@@ -83,7 +83,8 @@ def test_what_agents_see_is_declared():
 def test_weights_bring_back_the_agent_that_they_are_of(tmp_path):
     torch.manual_seed(0)
     agent, rng = StructuredAgent().eval(), np.random.default_rng(0)
-    save_weights(tmp_path / "agent.safetensors", agent, agent.config, {})
+    # What was written before agents knew of held torques says nothing of these.
+    save_weights(tmp_path / "agent.safetensors", agent, {"body": "ball"}, {})
     loaded, inputs = load(tmp_path / "agent.safetensors"), seen(1, rng)
     assert isinstance(loaded, StructuredAgent)
     said = [a.step(inputs, a.initial_state(np.array([3])))[0] for a in (agent, loaded)]

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from benchmarks import golden
+from mujoban_baselines import load
 from mujoban_baselines.actor import make_actor
 from mujoban_baselines.agents import MonolithicAgent, StructuredAgent, TopDownAgent
 from mujoban_baselines.critics import Critic
@@ -27,6 +28,7 @@ from mujoban_baselines.train import (
     mpo_parts,
     vtrace_parts,
 )
+from mujoban_core.agent import AgentInput
 from mujoban_core.bodies import ANT, BALL
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Cadence
@@ -165,6 +167,37 @@ def test_levels_are_training_levels_in_the_shares_of_the_paper():
         TaskConfig(episode_seconds=0.0)
     with pytest.raises(ValueError, match="episode_seconds is inf"):
         TaskConfig(episode_seconds=math.inf)
+
+
+@pytest.mark.parametrize(("method", "kind"), [("monolithic", TopDownAgent), ("structured", StructuredAgent)])
+def test_v_trace_learns_from_decisions_whose_torques_are_held_and_drawn_in_play_as_well(tmp_path, method, kind):
+    run = tmp_path / "run"
+    options = ["--robots", "3", "--levels", "easy", "--episode-seconds", "1", "--repeat", "4", "--draws", "pink"]
+    options += ["--vtrace.exploration", "pink", "--vtrace.unroll", "5", "--steps", "60"]
+    assert main([f"{method}-vtrace", "--run", str(run), *options]) == 0
+    curve = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert curve[-1]["step"] == (5 + 1) * 4 * 3, "one unroll, in environment steps"
+    assert curve[-1]["vtrace/rho"] == pytest.approx(1.0, abs=0.02), "on policy"
+    assert curve[-1]["solved/1_n"] == 3, "20 steps of an episode are 5 decisions"
+    agent = load(run / "agent.safetensors")
+    state, rng, torques = agent.initial_state(np.arange(2)), np.random.default_rng(0), []
+    for _ in range(8):
+        frame = rng.integers(0, 255, (1, 64, 64, 3), np.uint8)
+        seen = {"top_down": frame, "proprio": rng.normal(size=(1, 16)).astype(np.float32)}
+        seen["abstract_state"] = np.zeros((1, 10, 10, 4), np.float32)
+        alike = AgentInput(**{name: np.repeat(seen[name], 2, 0) for name in kind.sees})
+        torque, state = agent.step(alike, state)
+        torques.append(torque)
+    assert [i for i in range(1, 8) if not np.array_equal(torques[i], torques[i - 1])] == [4]
+    assert not np.allclose(torques[0][0], torques[0][1], atol=1e-3), "both see the same, and draw for themselves"
+
+
+def test_a_subgoal_has_its_50_steps_however_long_torques_are_held():
+    task = partial(MujobanTask, TaskConfig(robots=3, episode_seconds=60.0))
+    actor = make_actor(task, partial(StructuredAgent, repeat=4), 30, 1, (), "white", 0, 0)
+    over = actor.act().arrays["pseudo_over"]
+    actor.close()
+    assert over[:13].any(0).all() and over[13:26].any(0).all(), "13 decisions are 52 steps"
 
 
 def test_a_run_by_command_leaves_an_agent_and_a_curve(tmp_path, capsys):
