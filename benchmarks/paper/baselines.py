@@ -137,6 +137,8 @@ _ROBOT, _ABOVE = "o_cam, o_pr, o_pos", "o_top, o_pr"
 _PARTIAL, _FULL, _NOT = "5 days, 256 actors", "21 days, 1,000 actors", "not there"
 _MPO: Final = "monolithic-mpo --repeat 4 --mpo.reuse 4 --draws pink"
 """What solves most of difficulty 1 (docs/research/baselines.md); what goes on from a clone acts as that does."""
+_VTRACE: Final = "--repeat 4 --draws pink --vtrace.exploration pink"
+"""The same for V-trace, whose own noise is white."""
 MODULAR: Final = Baseline(
     "modular", "modular", _ROBOT, "all difficulties, bottom-up", f"--world {DEFAULT_WORLD}",
     "7 days, 200 to 1,000 actors a module", tuple(ROLES), "bringup.train_all", weights="weights",
@@ -154,8 +156,10 @@ BASELINES: Final = (
         "monolithic-mpo --levels curriculum --mpo.critic-first 1000", _NOT, cloning="clone --bags bags/stack",
     ),
     Baseline("clone", "cloning of the stack alone", _ROBOT, "bags", "clone --bags bags/stack", _NOT),
-    Baseline("vtrace", "V-trace", _ABOVE, "curriculum", "monolithic-vtrace", _FULL),
-    Baseline("structured", "structured V-trace", f"{_ABOVE}, s_abst", "curriculum", "structured-vtrace", _FULL),
+    Baseline("vtrace", "V-trace", _ABOVE, "curriculum", f"monolithic-vtrace {_VTRACE}", _FULL),
+    Baseline(
+        "structured", "structured V-trace", f"{_ABOVE}, s_abst", "curriculum", f"structured-vtrace {_VTRACE}", _FULL
+    ),
     Baseline(
         "joint", "modular, fine-tuned as a whole", _ROBOT, "hard, from the row as it ships", "joint", _NOT,
         ("controller", "planner"),
