@@ -15,9 +15,7 @@ def load(path: str | Path | None = None, device: str = "cpu") -> Agent:
     Raises:
         mujoban_rl.weights.WeightsError: If there are none, or they are damaged or do not fit.
     """
-    from mujoban_baselines.agents import AGENTS
-    from mujoban_baselines.drawing import Drawing
-    from mujoban_baselines.repeat import Repeating
+    from mujoban_baselines.agents import AGENTS, playing
     from mujoban_rl.weights import WeightsError, load_weights, read_record
 
     if path is None:
@@ -25,6 +23,4 @@ def load(path: str | Path | None = None, device: str = "cpu") -> Agent:
     name = read_record(path)["class"]
     if name not in AGENTS:
         raise WeightsError(f"{path}: holds weights of {name}, expected one of {', '.join(AGENTS)}")
-    agent = load_weights(AGENTS[name], path, device)
-    played = agent if agent.draws is None else Drawing(agent, agent.draws)
-    return played if agent.repeat == 1 else Repeating(played, agent.repeat, agent.action_size)
+    return playing(load_weights(AGENTS[name], path, device))

@@ -13,9 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from mujoban_baselines.drawing import Drawing
 from mujoban_baselines.networks import BodySense, Recurrent, RecurrentAgent, Sights, dense, view_encoder
+from mujoban_baselines.repeat import Repeating
 from mujoban_baselines.subgoals import Subgoals
-from mujoban_core.agent import AgentInput
+from mujoban_core.agent import Agent, AgentInput
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, GRID_SIZE
@@ -172,3 +174,19 @@ class StructuredAgent(TopDownAgent):
 
 AGENTS: Final[dict[str, Any]] = {cls.__name__: cls for cls in (MonolithicAgent, TopDownAgent, StructuredAgent)}
 """The agents that weights may be of, by the class that their record names."""
+
+
+def playing(agent: RecurrentAgent) -> Agent:
+    """Return what plays as an agent is to be played: by means or draws, in every tick or held."""
+    played = agent if agent.draws is None else Drawing(agent, agent.draws)
+    return played if agent.repeat == 1 else Repeating(played, agent.repeat, agent.action_size)
+
+
+def untrained() -> Agent:
+    """Return the floor of Table 1: what its monolithic agents of size S for the ball do before they learn.
+
+    Their means are close to 0, so that it plays the noise by which they explore. The same weights each time.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return playing(MonolithicAgent(repeat=4, draws="pink").eval())

@@ -50,10 +50,10 @@ TABLE_1 = """The agents that modular RL is compared with ([how each is trained](
 paper trained them for up to 21 days with 1,000 actors (fully observable) and 5 days with 256 (partially observable),
 and reports the best of many settings; here steps and CPU hours are what the row was given.
 """
-BUDGETS = f"""Every row but that of the stack as it ships is given the environment steps of the modular row and its
-{HOURS:g} h of two cores, whichever is spent first. Not counted are the recording of what is cloned, and the weights of
-the stack that ships where a row begins with them. `--seed 1 --run runs/baselines/NAME_seed1` trains the row NAME
-once more. The commands are
+BUDGETS = f"""Rows trained on nothing are the floor. Every other one but that of the stack as it ships is given the
+environment steps of the modular row and its {HOURS:g} h of two cores, whichever is spent first. Not counted are the
+recording of what is cloned, and the weights of the stack that ships where a row begins with them. `--seed 1 --run
+runs/baselines/NAME_seed1` trains the row NAME once more. The commands are
 """
 FIGURE_2 = """At every difficulty by the planner's policy alone; at difficulty 5 also the default, which searches ahead.
 """

@@ -72,6 +72,8 @@ class Baseline:
     """Folder of its run that holds the weights."""
     seed: int = 0
     """Of the run; with another one, the same is trained once more."""
+    agent: str = ""
+    """Name of an agent that plays without having been trained."""
     guide: str = ""
     """Page that says how it is trained, seen from that of the results."""
 
@@ -88,6 +90,8 @@ class Baseline:
     @property
     def commands(self) -> tuple[str, ...]:
         """The commands that train it, one after the other."""
+        if self.agent:
+            return ()
         run = f"runs/baselines/{self.name}"
         if self.program != "mujoban_baselines.train":
             return (f"python -m {self.program} {self.method} --hours {HOURS:g} --run {run}",)
@@ -116,6 +120,8 @@ class Baseline:
     def run(self, difficulty: int) -> Run:
         """Return its evaluation at a difficulty."""
         run = Run(f"{self.name}_{difficulty}", self.title, difficulty)
+        if self.agent:
+            return replace(run, further=("--agent", self.agent))
         folder = self.folder / self.weights
         if not self.roles:
             return replace(run, agent=folder / "agent.safetensors")
@@ -147,6 +153,11 @@ MODULAR: Final = Baseline(
 """The stack, from nothing within the same hours."""
 BASELINES: Final = (
     MODULAR,
+    Baseline("random", "even torques, each tick anew", "nothing", "nothing", "", _NOT, agent="random"),
+    Baseline(
+        "untrained", "MPO untrained: its noise, pink, held for 4 ticks", _ROBOT, "nothing", "", _NOT,
+        agent="mujoban_baselines.agents:untrained",
+    ),
     Baseline("mpo_hard", "MPO, asym.", _ROBOT, "hard", _MPO, _PARTIAL),
     Baseline("mpo_hard_sym", "MPO, sym.", _ROBOT, "hard", f"{_MPO} --critic symmetric", _PARTIAL),
     Baseline("mpo_curriculum", "MPO, asym.", _ROBOT, "curriculum", f"{_MPO} --levels curriculum", _PARTIAL),
@@ -165,9 +176,10 @@ BASELINES: Final = (
         ("controller", "planner"),
     ),
 )  # fmt: skip
-"""The stack, the agents of appendix D, a monolithic one that may copy, the stack fine-tuned for the task's reward."""
+"""The stack, what nobody has trained, the agents of appendix D, a monolithic one that may copy, and the stack
+fine-tuned for the task's reward."""
 JOINT: Final = BASELINES[-1]
-AGAIN: Final = tuple(baseline.again(1) for baseline in BASELINES[1:])
+AGAIN: Final = tuple(baseline.again(1) for baseline in BASELINES[1:] if not baseline.agent)
 """The agents once more, with another seed; they are shown where they were measured."""
 RUNS: Final = tuple(baseline.run(d) for baseline in (*BASELINES, *AGAIN) for d in DIFFICULTIES)
 """Their evaluations."""
@@ -227,7 +239,7 @@ def points_of(baseline: Baseline) -> list[dict[str, Any]]:
 
 def note(given: Sequence[str]) -> None:
     """Write the curves of runs, given as NAME=RUN."""
-    known = {baseline.name: baseline for baseline in (*BASELINES, *AGAIN)}
+    known = {baseline.name: baseline for baseline in (*BASELINES, *AGAIN) if not baseline.agent}
     for text in given:
         name, equals, run = text.partition("=")
         if not equals or name not in known:

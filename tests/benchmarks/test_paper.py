@@ -12,7 +12,7 @@ from bringup.command import Choice, Stack
 from bringup.results import EpisodeResult, Failure, report
 from mujoban_baselines.train import COMMANDS, PROG
 from mujoban_core.files import digest
-from mujoban_core.plugins import ROLES, shipped_weights
+from mujoban_core.plugins import ROLES, load_module, shipped_weights
 from mujoban_core.program import read_options
 from mujoban_core.reports import count_uses, noted_uses, write_report
 from mujoban_planner import curves as planner_curves
@@ -40,9 +40,9 @@ def test_without_sources_the_page_names_the_commands_that_make_them(folder, caps
     assert "Rows are of the *reference* world" in page
     assert "python -m benchmarks.paper.runs --only film_strip" in page
     assert "python -m benchmarks.paper.curves --controller RUN" in page
-    assert page.count("not measured |") == 88, (
-        "two rows of Table 1, three of Table 2 and six beside, six of Figure 2, sixteen of Figure 5, eleven agents at "
-        "five difficulties"
+    assert page.count("not measured |") == 98, (
+        "two rows of Table 1, three of Table 2 and six beside, six of Figure 2, sixteen of Figure 5, thirteen agents "
+        "at five difficulties"
     )
     assert "no source yet" in capsys.readouterr().err
 
@@ -294,7 +294,21 @@ def test_every_row_is_trained_by_a_command_that_exists_with_the_same_budget(caps
             assert options.config.seed == row.seed and options.run.name.startswith(row.name)
             steps, cpu_seconds = steps + options.config.steps, cpu_seconds + options.config.cpu_seconds
         whole = pytest.approx((baselines.steps(), 7200.0), abs=1.0)
-        assert row is baselines.MODULAR or (steps, cpu_seconds) == whole
+        assert row is baselines.MODULAR or row.agent or (steps, cpu_seconds) == whole
+
+
+def test_table_1_has_a_floor_that_is_measured_without_a_training(folder, monkeypatch):
+    measured = []
+    monkeypatch.setattr(parts, "evaluate", lambda run, options: measured.append(run))
+    assert runs.main(["--only", "untrained_1", "random_1"]) == 0
+    agents = [load_module("agent", run.options()[run.options().index("--agent") + 1]) for run in measured]
+    assert [run.name for run in measured] == ["random_1", "untrained_1"] and len(agents) == 2
+    write(measured[1], 1, 4, {"agent": "mujoban_baselines.agents:untrained"})
+    page = results.rebuild(folder).read_text()
+    cells = "o_cam, o_pr, o_pos | nothing | - | - | - | not there | 4 | 25.0 % (4.6 to 69.9) | not measured"
+    assert f"| MPO untrained: its noise, pink, held for 4 ticks | {cells}" in page
+    with pytest.raises(ValueError, match="random=x: expected NAME=RUN"):
+        baselines.main(["random=x"])
 
 
 def test_agents_get_the_steps_that_the_modular_row_took(folder):

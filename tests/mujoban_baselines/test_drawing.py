@@ -9,6 +9,7 @@ from mujoban_baselines.agents import MonolithicAgent
 from mujoban_baselines.drawing import Drawing
 from mujoban_core.agent import AgentInput
 from mujoban_core.interfaces import renew_rows, take_rows
+from mujoban_core.plugins import load_module
 from mujoban_rl.weights import save_weights
 
 
@@ -63,3 +64,16 @@ def test_weights_say_that_they_are_played_so(agent, tmp_path):
     assert not np.allclose(torques[0][0], torques[0][1], atol=1e-3), "both see the same, and draw for themselves"
     with pytest.raises(ValueError, match="exploration 'brown': expected one of pink, white"):
         MonolithicAgent(draws="brown")
+
+
+def test_the_floor_is_the_noise_of_an_agent_that_knows_nothing():
+    one, other = (load_module("agent", "mujoban_baselines.agents:untrained") for _ in range(2))
+    seeds = np.arange(256)
+    torques = np.array([one.step(alike(256), one.initial_state(seeds))[0] for one in (one, other)])
+    assert np.array_equal(*torques), "the same weights each time"
+    assert abs(torques[0].mean(0)).max() < 0.1 and torques[0].std(0) == pytest.approx([0.45, 0.45], abs=0.05)
+    state, held = one.initial_state(seeds), []
+    for _ in range(5):
+        torque, state = one.step(alike(256), state)
+        held.append(torque)
+    assert [i for i in range(1, 5) if not np.array_equal(held[i], held[i - 1])] == [4]
