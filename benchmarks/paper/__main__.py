@@ -55,6 +55,13 @@ environment steps of the modular row and its {HOURS:g} h of two cores, whichever
 recording of what is cloned, and the weights of the stack that ships where a row begins with them. `--seed 1 --run
 runs/baselines/NAME_seed1` trains the row NAME once more. The commands are
 """
+EQUAL = """What equal budgets leave unequal: steps of the modular row are those of its controller's trainings and of its
+recordings; what its planner plays under the abstract rules costs CPU time alone. CPU hours compare rows of one machine:
+the two cores of the modular row computed in bfloat16, and had other trainings beside, hence its time by the clock. Of
+its modules the controller is the one that solved the most validation levels, the planner a moving average of its
+weights; the senses, all agents and the stack fine-tuned as a whole are as their training left them. Agents that learn
+by MPO or cloning are of size S.
+"""
 FIGURE_2 = """At every difficulty by the planner's policy alone; at difficulty 5 also the default, which searches ahead.
 """
 FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
@@ -99,6 +106,7 @@ def rebuild(folder: Path) -> Path:
         tables.baselines(),
         BUDGETS,
         tables.commands(),
+        EQUAL,
         "Why episodes of difficulty 5 fail, before fine-tuning as a whole and after:\n",
         tables.failures((POLICY_ALONE[0], JOINT.run(POLICY_ALONE[0].difficulty))),
         *_baseline_curves(folder),
