@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.paper import baselines, bodies, curves, figures, film, tables
-from benchmarks.paper.baselines import HOURS, JOINT
+from benchmarks.paper.baselines import AGAIN, BASELINES, HOURS, JOINT, RECORDING
 from benchmarks.paper.runs import (
     ALL,
     CONFIGURATIONS,
@@ -52,8 +52,7 @@ and reports the best of many settings; here steps and CPU hours are what the row
 """
 BUDGETS = f"""Rows trained on nothing are the floor. Every other one but that of the stack as it ships is given the
 environment steps of the modular row and its {HOURS:g} h of two cores, whichever is spent first. Not counted are the
-recording of what is cloned, and the weights of the stack that ships where a row begins with them. `--seed 1 --run
-runs/baselines/NAME_seed1` trains the row NAME once more. The commands are
+recording of what is cloned, and the weights of the stack that ships where a row begins with them. The commands are
 """
 EQUAL = """What equal budgets leave unequal: steps of the modular row are those of its controller's trainings and of its
 recordings; what its planner plays under the abstract rules costs CPU time alone. CPU hours compare rows of one machine:
@@ -105,7 +104,10 @@ def rebuild(folder: Path) -> Path:
         TABLE_1,
         tables.baselines(),
         BUDGETS,
-        tables.commands(),
+        tables.commands(BASELINES, RECORDING),
+        "<details><summary>All but the modular row once more, with another seed</summary>\n",
+        tables.commands(AGAIN),
+        "</details>\n",
         EQUAL,
         "Why episodes of difficulty 5 fail, before fine-tuning as a whole and after:\n",
         tables.failures((POLICY_ALONE[0], JOINT.run(POLICY_ALONE[0].difficulty))),

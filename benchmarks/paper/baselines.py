@@ -193,21 +193,21 @@ class Options:
     """Names of baselines and their run directories."""
 
 
-def read_curve(run: Path) -> list[dict[str, Any]]:
+def read_curve(run: Path, *, cloned: bool = False) -> list[dict[str, Any]]:
     """Return at most `_MOST` points of a run, each the mean over a stretch of it; of the stack's, what it cost alone.
 
-    What a cloning before it took counts as taken before its first step.
+    Args:
+        run: Its directory.
+        cloned: Whether it began with the cloning in the directory beside it, whose name ends in `_start`. What that
+            took counts as taken before the first step.
 
     Raises:
-        ResultError: If it has no metrics.
+        ResultError: If it, or such a cloning, has no metrics.
     """
     if (run / "pipeline.json").exists():
         return [cost(run) | {kind: {} for kind in _KINDS}]
-    lines = read_metrics(run)
-    if not lines:
-        raise ResultError(f"{run}: its metrics are empty")
-    start = run.with_name(run.name + _START)
-    before = read_metrics(start)[-1] if start.exists() else {}
+    lines = _lines(run)
+    before = _lines(run.with_name(run.name + _START))[-1] if cloned else {}
     points = []
     for part in np.array_split(np.array(lines, object), min(len(lines), _MOST)):
         spent = ("step", "cpu_seconds", "seconds")
@@ -217,6 +217,12 @@ def read_curve(run: Path) -> list[dict[str, Any]]:
             point[kind] = {d: round(mean[0], 4) for d, mean in means.items() if mean is not None}
         points.append(point)
     return points
+
+
+def _lines(run: Path) -> list[dict[str, Any]]:
+    if lines := read_metrics(run):
+        return lines
+    raise ResultError(f"{run}: its metrics are empty")
 
 
 def points_of(baseline: Baseline) -> list[dict[str, Any]]:
@@ -244,7 +250,7 @@ def note(given: Sequence[str]) -> None:
         name, equals, run = text.partition("=")
         if not equals or name not in known:
             raise ValueError(f"{text}: expected NAME=RUN with a name among {', '.join(known)}")
-        points = read_curve(Path(run))
+        points = read_curve(Path(run), cloned=bool(known[name].cloning))
         write_atomically(known[name].curve, "".join(json.dumps(point) + "\n" for point in points).encode())
         print(f"{known[name].curve.name}: {len(points)} points, {points[-1]['step']} steps")
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.paper.baselines import AGAIN, BASELINES, MODULAR, RECORDING, points_of
+from benchmarks.paper.baselines import AGAIN, BASELINES, MODULAR, Baseline, points_of
 from benchmarks.paper.runs import DIFFICULTY, Run, distinct, is_stale, load
 from bringup.results import Failure
 from mujoban_core.grid import DIFFICULTIES
@@ -99,9 +99,9 @@ def baselines() -> str:
     return _table(header, rows)
 
 
-def commands() -> str:
-    """Return the commands that train the rows of Table 1, as a block of code."""
-    return "".join(f"    {line}\n" for line in (RECORDING, *(c for row in BASELINES for c in row.commands)))
+def commands(rows: Sequence[Baseline], *before: str) -> str:
+    """Return the commands that train rows of Table 1, after those that have to come before, as a block of code."""
+    return "".join(f"    {line}\n" for line in (*before, *(c for row in rows for c in row.commands)))
 
 
 def _cost(points: Sequence[dict[str, Any]]) -> list[str]:
