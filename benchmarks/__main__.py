@@ -12,7 +12,7 @@ import tyro
 
 from benchmarks.command import run_benchmark
 
-DEFAULT: Final = ("world", "rendering", "graph", "levels", "actors")
+DEFAULT: Final = ("world", "rendering", "graph", "levels", "actors", "baselines")
 """Benchmarks of speed; each has a `run` that returns a mapping."""
 
 
