@@ -28,9 +28,8 @@ EPISODES: Final = 512
 """Levels of an evaluation (paper C.5)."""
 DIGEST_LENGTH: Final = 64
 """Characters of a digest of weights; what is shorter names a class that stands in."""
-
-
-_LEARNED_SCOUT: Final = ("--scout", "learned")
+EXPLORING: Final = "python -m mujoban_planner.train explorer --run runs/explorer"
+"""Trains the scout that says where to look."""
 
 
 class ResultError(ValueError):
@@ -56,6 +55,8 @@ class Run:
     """Roles of modules, and weights other than those that ship which play them."""
     further: tuple[str, ...] = ()
     """Further options of `bringup/evaluate.py`."""
+    training: str = ""
+    """Command that trains the weights that do not ship; of agents, Table 1's page has it."""
 
     @property
     def file(self) -> Path:
@@ -69,8 +70,7 @@ class Run:
 
     def missing_weights(self) -> Path | None:
         """Return where weights that are trained apart from the stack's should be and are not."""
-        scout = [shipped_weights(SCOUT)] if _LEARNED_SCOUT[0] in self.further else []
-        return next((path for path in (*self.own.values(), *scout) if not path.is_file()), None)
+        return next((path for path in self.own.values() if not path.is_file()), None)
 
     @property
     def own(self) -> dict[str, Path]:
@@ -113,11 +113,15 @@ GRAPH: Final = Run("graph", "default, through the ROS graph", further=("--graph"
 LOOKING_AROUND: Final = (
     Run("look_around_none", "none", further=("--look-around", "0")),
     CONFIGURATIONS[0],
-    Run("look_around_learned", "learned", further=_LEARNED_SCOUT),
+    Run(
+        "look_around_learned", "learned", modules=((SCOUT, ROOT / "runs" / "explorer" / "explorer.safetensors"),),
+        training=EXPLORING,
+    ),
 )
-"""What says where to look before pushing: nothing, the rule that ships, a network."""
+"""What says where to look before pushing: nothing, the rule that ships, a network that does not ship."""
 ALL: Final = (
-    *CONFIGURATIONS, *POLICY_ALONE, *DIFFICULTY[:-1], GRAPH, *(run for run in LOOKING_AROUND if run.further),
+    *CONFIGURATIONS, *POLICY_ALONE, *DIFFICULTY[:-1], GRAPH,
+    *(run for run in LOOKING_AROUND if run is not CONFIGURATIONS[0]),
 )  # fmt: skip
 
 
@@ -161,7 +165,7 @@ def is_stale(report: dict[str, Any], run: Run | None = None) -> bool:
     What is to play and is not on this machine counts as what played: the weights of agents do not ship.
     """
     body, own = (None, {}) if run is None else (run.body, run.own)
-    current = {role: shipped_weights(role, body) for role in (*ROLES, SCOUT)} | own
+    current = {role: shipped_weights(role, body) for role in ROLES} | own
     told = {role: name.removesuffix(PRIVILEGED) for role, name in report["weights"].items() if role in current}
     return any(
         len(name) == DIGEST_LENGTH and current[role].is_file() and name != digest(current[role])
@@ -216,7 +220,8 @@ def rerun(options: Options) -> None:
         if run.name not in chosen:
             continue
         if (missing := run.missing_weights()) is not None:
-            print(f"{run.name}: no weights at {missing} yet", flush=True)
+            how = f": {run.training}" if run.training else ""
+            print(f"{run.name}: no weights at {missing} yet{how}", flush=True)
             continue
         if is_current(run, options.episodes) and not options.again:
             print(f"{run.name}: measured already with these weights (--again measures anew)", flush=True)

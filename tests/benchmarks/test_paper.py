@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from dataclasses import replace
 
 import pytest
 
@@ -12,7 +13,7 @@ from bringup.command import Choice, Stack
 from bringup.results import EpisodeResult, Failure, report
 from mujoban_baselines.train import COMMANDS, PROG
 from mujoban_core.files import digest
-from mujoban_core.plugins import ROLES, load_module, shipped_weights
+from mujoban_core.plugins import ROLES, SCOUT, load_module, shipped_weights
 from mujoban_core.program import read_options
 from mujoban_core.reports import count_uses, noted_uses, write_report
 from mujoban_planner import curves as planner_curves
@@ -265,6 +266,22 @@ def test_an_agent_that_was_trained_anew_is_measured_anew(folder, monkeypatch, ca
     weights.unlink()
     assert runs.is_current(run, 4), "where the weights are not, nothing is known against them"
     assert runs.main(["--only", "mine"]) == 0 and "no weights at" in capsys.readouterr().out
+
+
+def test_the_learned_scout_is_measured_by_weights_of_ones_own(folder, monkeypatch, capsys):
+    file = folder / "explorer.safetensors"
+    (row,) = (run for run in runs.ALL if run.name == "look_around_learned")
+    assert row.own == {SCOUT: runs.ROOT / "runs/explorer/explorer.safetensors"}
+    learned = replace(row, modules=((SCOUT, file),))
+    monkeypatch.setattr(runs, "ALL", (learned,))
+    command = "python -m mujoban_planner.train explorer --run runs/explorer"
+    assert runs.main(["--only", learned.name]) == 0
+    assert f"{learned.name}: no weights at {file} yet: {command}" in capsys.readouterr().out
+    assert f"`{command}`" in results.rebuild(folder).read_text()
+    measured = []
+    monkeypatch.setattr(parts, "evaluate", lambda run, options: measured.append(run.options()))
+    file.write_bytes(b"weights")
+    assert runs.main(["--only", learned.name]) == 0 and measured[0][-2:] == ["--scout", str(file)]
 
 
 def test_the_fine_tuned_stack_has_a_row_and_its_failures_beside_what_it_came_from(folder):
