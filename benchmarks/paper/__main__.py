@@ -135,6 +135,8 @@ def rebuild(folder: Path) -> Path:
         "## Figure 5: another body, the same planner\n",
         FIGURE_5,
         tables.configurations(bodies.RUNS),
+        "Why episodes fail:\n",
+        tables.failures(bodies.RUNS),
         *_figure_5(folder),
         *_film_strip(ANT.name, "An episode of the ant", folder / "figure5_ant.png"),
     ]

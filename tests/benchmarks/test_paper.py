@@ -452,8 +452,12 @@ def test_figure_5_has_both_bodies_and_marks_a_controller_that_is_another_now(fol
     write(ant[3], 4, 4, {**shipped, "controller": f"{'0' * 64} (privileged)"})
     write(camera[4], 4, 4, shipped)
     write(camera[3], 4, 4, {role: digest(shipped_weights(role)) for role in ROLES})  # the ball's
+    lost = [EpisodeResult(i, False, 3.0, 100, 9, 0, 0, Failure.CONTROLLER_TIME_OUT) for i in range(3)]
+    write_report(report(lost, shipped), camera[2].file)
     assert results.rebuild(folder) == folder / "README.md"
     page = (folder / "README.md").read_text()
+    causes = page.split("## Figure 5")[1].split("Why episodes fail:")[1]
+    assert f"| {camera[2].title} | 3 |" in causes and Failure.CONTROLLER_TIME_OUT.meaning in causes
     assert "| ant, by ground truth (privileged), difficulty 5 | `ant_5` |" in page and "| 73.7 % |" in page
     assert f"| ant, by ground truth (privileged), difficulty 4{tables.STALE} | `ant_4` |" in page
     assert "| ant, by its camera, difficulty 5 | `ant_camera_5` |" in page
