@@ -68,7 +68,7 @@ class Options:
     """Estimator and termination are trained together: name the run for both."""
     termination: tuple[Path, ...] = ()
     variant: str = ""
-    """Name of another way to train, whose curve stands beside the supervised one."""
+    """Name of another way to train, whose curve stands beside that of the weights that ship."""
     append: bool = False
     """Go on after the last point of the file, as where the metrics of earlier runs are lost."""
     out: Path = JSON

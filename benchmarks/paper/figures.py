@@ -25,6 +25,8 @@ from mujoban_core.grid import DIFFICULTIES
 from mujoban_sim.presets import DEFAULT_WORLD
 
 _COLUMNS: Final = 4
+_METHODS: Final = {"controller": "distillation", "planner": "expert iteration"}
+"""What the weights that ship learned by; the other modules' by supervision."""
 _VARIANTS: Final = {"mpo": "MPO alone, from nothing"}
 """Other ways to train a module, by the names of their files."""
 _SAMPLES: Final = {"controller": "ticks played", "planner": "samples"}
@@ -117,7 +119,7 @@ def baseline_curves(file: Path) -> bool:
 def curves(file: Path) -> list[str]:
     """Draw the learning curves of the modules (paper Fig. 4) that there are; return the modules without one.
 
-    Beside the supervised training towards the weights that ship stand the variants of a module, such as MPO alone.
+    Beside the training of the weights that ship stand the variants of a module, such as MPO alone.
 
     Raises:
         ResultError: If a curve is not what `benchmarks.paper.curves` writes.
@@ -132,7 +134,7 @@ def curves(file: Path) -> list[str]:
             prefix = f"curve_{module}_"
             others = {f.stem.removeprefix(prefix): _points(f) for f in sorted(sources.JSON.glob(f"{prefix}*.jsonl"))}
             variants = {_VARIANTS.get(name, name.replace("_", " ")): curve for name, curve in others.items()}
-            for name, curve in {"supervised": points, **variants}.items():
+            for name, curve in {_METHODS.get(module, "supervised"): points, **variants}.items():
                 steps, values = [p["step"] / 1e6 for p in curve], [p["value"] for p in curve]
                 axes.plot(steps, values, marker=".", markersize=3, label=name)
             what = {p["what"] for curve in (points, *others.values()) for p in curve}

@@ -404,13 +404,17 @@ def test_figures_name_their_axes_their_bars_and_each_curve_in_words(folder, draw
     assert axes.get_legend().get_title().get_text() == "bars: 95 % intervals (Wilson)"
     _, alone, default = words(axes)
     assert alone.endswith("the planner's policy alone") and default == "the default, with the search ahead"
-    for name in ("controller", "controller_mpo", "controller_other_way"):
+    beside = ("planner", "planner_mpo", "estimator", "estimator_mpo")
+    for name in ("controller", "controller_mpo", "controller_other_way", *beside):
         points = [{"step": 1000 * i, "value": i / 3, "what": "instructions completed"} for i in range(4)]
         (runs.JSON / f"curve_{name}.jsonl").write_text("".join(json.dumps(point) + "\n" for point in points))
     figures.curves(folder / "figure4.png")
-    (axes,) = drawn()
+    axes, *others = drawn()
+    assert [words(other)[0] for other in others] == ["expert iteration", "supervised"]
+    for name in beside:
+        (runs.JSON / f"curve_{name}.jsonl").unlink()
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("million ticks played", "instructions completed")
-    assert words(axes) == ["supervised", "MPO alone, from nothing", "other way"]
+    assert words(axes) == ["distillation", "MPO alone, from nothing", "other way"]
     assert axes.yaxis.get_major_formatter()(0.5, 0) == "50 %"
     losses = [{"step": 1000 * i, "value": 2.0**-i, "what": "loss of beta"} for i in range(4)]
     (runs.JSON / "curve_termination.jsonl").write_text("".join(json.dumps(point) + "\n" for point in losses))
