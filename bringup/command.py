@@ -239,12 +239,22 @@ def recorded_seed(seed: int | None, *, records: bool, allow_test_seeds: bool) ->
 
 
 def oracle(role: str, body: str) -> Choice:
-    """Return what knows the truth in a role; the script that drives the ball can drive no other body."""
-    if role == "controller" and body != BALL.name:
-        from mujoban_controller import teacher_weights
+    """Return what knows the truth in a role; a body that no script drives is driven by its privileged teacher.
 
-        return Choice(role, LEARNED, teacher_weights(body))
-    return Choice(role, ORACLE)
+    Raises:
+        ValueError: If the body is unknown, or no weights of such a teacher ship.
+    """
+    if role != "controller" or get_body(body).scripted:
+        return Choice(role, ORACLE)
+    from mujoban_controller import teacher_weights
+
+    weights = teacher_weights(body)
+    if not weights.is_file():
+        raise ValueError(
+            f"no oracle drives the body {body}: expected its privileged teacher at {weights}, or one named by "
+            "--controller WEIGHTS"
+        )
+    return Choice(role, LEARNED, weights)
 
 
 def import_from_here(path: Sequence[str] = ("",)) -> None:

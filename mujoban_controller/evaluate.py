@@ -25,7 +25,7 @@ from mujoban_controller.judge import judge
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_controller.scripted import scripted_driver
 from mujoban_controller.turning import judge_turning
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import get_body
 from mujoban_core.files import check_file, digest
 from mujoban_core.plugins import PRIVILEGED, privileged_roles
 from mujoban_core.program import read_options, run_command
@@ -70,8 +70,8 @@ class Options:
             raise ValueError(f"--episodes {self.episodes}: expected at least 1")
         if seed_range(self.seed, self.episodes) == "training":
             raise ValueError(f"--seed {self.seed}: expected seeds of validation or test, not of training")
-        if self.driver == "scripted" and self.body != BALL.name:
-            raise ValueError(f"--driver scripted: drives the {BALL.name} alone, not --body {self.body}")
+        if self.driver == "scripted" and not get_body(self.body).scripted:
+            raise ValueError(f"--driver scripted: no script drives --body {self.body}, expected camera or teacher")
 
 
 def make_driver(options: Options) -> tuple[Driver, str]:

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import BODIES
 from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_XY, TARGET, WALL, Instruction, xy_to_cell
 from mujoban_core.interfaces import (
     Controller,
@@ -204,32 +204,33 @@ class OracleController(Controller):
     """A scripted driver that knows where everything is: turn, drive along the lane, reverse to recentre."""
 
     privileged = True
-    config: Final = {"body": BALL.name}
-    """The script drives no other body."""
 
     def __init__(self, gains: DrivingGains | None = None) -> None:
-        """Drive the ball body with the given gains."""
-        self._gains = gains or DrivingGains()
+        """Drive the body that scripts drive, and no other, with the given gains."""
+        body = next(body for body in BODIES.values() if body.scripted)
+        self.config = {"body": body.name}
+        self._gains, self._cell_size = gains or DrivingGains(), body.cell_size
 
     def initial_memory(self, batch: int) -> Memory:
         """Return goals of robots without an instruction."""
-        return GoalTracker(batch).memory()
+        return GoalTracker(batch, cell_size=self._cell_size).memory()
 
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques, [B, 2], and the goals in force."""
-        goals, truth = follow_goals(inputs, state, BALL.cell_size)
-        return drive(goals, truth, self._gains), goals.memory()
+        goals, truth = follow_goals(inputs, state, self._cell_size)
+        return drive(goals, truth, self._gains, self._cell_size), goals.memory()
 
 
-def drive(goals: GoalTracker, truth: GroundTruth, gains: DrivingGains) -> NDArray[np.float32]:
+def drive(goals: GoalTracker, truth: GroundTruth, gains: DrivingGains, size: float) -> NDArray[np.float32]:
     """Return the scripted driver's torques (roll, steer), normalised, [B, 2].
 
     Args:
         goals: the instructions in force.
         truth: where everything is.
         gains: the driver's gains.
+        size: edge of a cell [m].
     """
-    g, size = gains, BALL.cell_size
+    g = gains
     pose, velocity = truth.pose.astype(np.float64), truth.velocity.astype(np.float64)
     push = goals.kind == GoalKind.PUSH
     # Shape [B, 2]; zero where the robot holds its cell.

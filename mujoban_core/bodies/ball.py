@@ -51,4 +51,5 @@ BALL: Final = Body(
     mjcf=_MJCF,
     turn=(0.0, 0.7),
     look_ticks=58,
+    scripted=True,
 )

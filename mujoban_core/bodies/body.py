@@ -176,6 +176,8 @@ class Body:
         turn: the action, U values in [-1, 1], that turns it to its left on the spot; None where no single one does, and
             its controller learns to turn while it is told to stay.
         look_ticks: ticks in which it turns once; 0 where it does not, and then it does not look around by default.
+        scripted: whether scripts that know the truth drive it, by torques (roll, steer); otherwise its oracle is its
+            privileged teacher.
     """
 
     name: str
@@ -193,6 +195,7 @@ class Body:
     mjcf: str
     turn: tuple[float, ...] | None = None
     look_ticks: int = 0
+    scripted: bool = False
 
     @property
     def action_size(self) -> int:
