@@ -16,13 +16,14 @@ _SCRIPTS = {"mujoban-run": "run_stack", "mujoban-evaluate": "evaluate", "mujoban
 
 
 def commands(page: Path) -> list[str]:
-    """Return the command lines of a page, indented or in a fenced block; those that go on over several lines as one."""
+    """Return the commands of a page, whole though over several lines: indented, fenced or alone in a table's cell."""
     text = page.read_text().replace("\\\n", " ")
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     fenced = "\n".join(block for language, block in blocks if language in ("", "sh", "bash"))
-    command = r"((?:python|mujoban-(?:run|evaluate|record)|make) .*)$"
-    return re.findall(rf"^ {{4,}}{command}", text, re.MULTILINE) + re.findall(f"^{command}", fenced, re.MULTILINE)
-
+    command = r"(?:python|mujoban-(?:run|evaluate|record)|make) "
+    indented = re.findall(rf"^ {{4,}}({command}.*)$", text, re.MULTILINE)
+    cells = re.findall(rf"\| `({command}[^`]*)` \|", text)
+    return indented + re.findall(rf"^({command}.*)$", fenced, re.MULTILINE) + cells
 
 
 def program(words: list[str]) -> tuple[str, list[str]]:
@@ -60,9 +61,10 @@ def test_a_documented_command_exists_and_understands_its_options(command, monkey
     assert ended.type is Read or "--help" in arguments
 
 
-def test_commands_in_fences_and_in_steps_of_a_list_are_read_too():
+def test_commands_in_fences_in_steps_of_a_list_and_in_tables_are_read_too():
     found = {page.name: " ".join(commands(page)) for page in GUIDES}
     assert "--stage distil" in found["controller.md"] and "mujoban_estimator.evaluate" in found["estimator.md"]
+    assert "--start" in found["adding_a_body.md"] and "mujoban_sim.node" in found["graph.md"]
 
 
 def test_a_documented_target_of_make_exists():
