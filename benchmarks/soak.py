@@ -31,6 +31,7 @@ from mujoban_core.signals import StopSignal
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.runtime.shared_memory import FOLDER
 from mujoban_msgs_py.runtime.tick_node import live_qos
+from mujoban_sokoban.generator import VALIDATION_SEEDS
 
 MODES: Final[dict[str, list[str]]] = {"lockstep": [], "real time": ["--realtime", "1"]}
 COLUMNS: Final = ("megabytes", "file_descriptors", "threads", "shared_megabytes", "ticks_per_second")
@@ -123,7 +124,8 @@ def measure(options: Options) -> dict[str, Any]:
     """Return the slopes."""
     os.environ["ROS_DOMAIN_ID"] = str(60 + os.getpid() % 40)
     # More episodes than any number of hours holds.
-    command = [sys.executable, "bringup/run_stack.py", "--headless", "--episodes", "1000000", *MODES[options.mode]]
+    levels = ["--seed", str(VALIDATION_SEEDS.start), "--episodes", "1000000"]
+    command = [sys.executable, "bringup/run_stack.py", "--headless", *levels, *MODES[options.mode]]
     child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     rclpy.init()
     try:

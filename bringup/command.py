@@ -215,13 +215,12 @@ Player = Stack | Solo
 """What commands play with."""
 
 
-def recorded_seed(seed: int | None, *, records: bool, allow_test_seeds: bool) -> int:
-    """Return the seed of the first episode: of those for training where it is recorded and nobody says otherwise.
+def recorded_seed(seed: int | None, *, allow_test_seeds: bool) -> int:
+    """Return the seed of the first episode of a recording: of those for training where nobody says otherwise.
 
     Args:
         seed: As given on the command line; None where it was not.
-        records: Whether the episodes are recorded.
-        allow_test_seeds: Whether they may be recorded though they are not for training.
+        allow_test_seeds: Whether episodes may be recorded though they are not for training.
 
     Raises:
         ValueError: If they are not for training and that is not allowed.
@@ -229,8 +228,8 @@ def recorded_seed(seed: int | None, *, records: bool, allow_test_seeds: bool) ->
     from mujoban_sokoban.generator import TRAIN_SEEDS
 
     if seed is None:
-        return TRAIN_SEEDS.start if records else 0
-    if records and seed not in TRAIN_SEEDS and not allow_test_seeds:
+        return TRAIN_SEEDS.start
+    if seed not in TRAIN_SEEDS and not allow_test_seeds:
         raise ValueError(
             f"--seed {seed}: its levels are not for training; expected one from {TRAIN_SEEDS.start} on for a "
             "recording, or --allow-test-seeds"

@@ -189,14 +189,14 @@ class EpisodeOptions(WorldOptions):
     episodes: Annotated[int | None, whole("N")] = None
     """Number of episodes; by default one, or as many as the level file has."""
     seed: Annotated[int | None, whole("N", 0)] = None
-    """Seed of the first episode; episode i has seed + i."""
+    """Seed of the first episode; episode i has seed + i. By default none of those for results (docs/levels.md)."""
     time_limit: Annotated[int | None, whole("STEPS")] = None
     """Steps of an episode; by default those of the body."""
     levels: FilePath = None
     """Play the levels of a Boxoban text file instead of generated ones."""
 
-    def make(self, seed: int) -> Episodes:
-        """Return the episodes from a seed on; say on stderr which levels of a file are unsolvable."""
+    def make(self, seed: int | None) -> Episodes:
+        """Return the episodes from a seed on (None: see `Episodes`); say on stderr which of a file are unsolvable."""
         from mujoban_sokoban.episodes import Episodes
         from mujoban_sokoban.solver import Status, solve_levels
 

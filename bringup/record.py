@@ -290,7 +290,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     options = read_options(Options, command_line, called(PROG), __doc__)
     import_from_here()
     check_folder("--out", options.out, may_exist=True)
-    seed = recorded_seed(options.seed, records=True, allow_test_seeds=options.allow_test_seeds)
+    seed = recorded_seed(options.seed, allow_test_seeds=options.allow_test_seeds)
     jobs = [_job(options, seed, part) for part in range(options.parts)]
     options.out.mkdir(parents=True, exist_ok=True)
     recorded = 0

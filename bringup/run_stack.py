@@ -59,7 +59,9 @@ def main(command_line: Sequence[str] | None = None) -> int:
     options = read_options(Options, command_line, called(PROG))
     play, stack = options.play, options.modules.player(options.play.body)
     import_from_here()
-    seed = recorded_seed(play.seed, records=options.record is not None, allow_test_seeds=options.allow_test_seeds)
+    seed = play.seed
+    if options.record is not None:
+        seed = recorded_seed(seed, allow_test_seeds=options.allow_test_seeds)
     check_folder("--record", options.record)
     check_file("--video", options.video)
     check_file("--json", options.json)

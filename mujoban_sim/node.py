@@ -50,7 +50,7 @@ def _setting(text: str, low: float | None = None, high: float | None = None) -> 
 
 
 PARAMETERS: Final[dict[str, tuple[Any, ParameterDescriptor]]] = {
-    "seed": (0, _setting("seed of the first episode; the next ones count on", 0, _MOST)),
+    "seed": (-1, _setting("seed of the first episode; the next ones count on; -1: none for results", -1, _MOST)),
     "episodes": (0, _setting("episodes to play; 0: all levels of a level file, else one", 0, _MOST)),
     "difficulty": (max(DIFFICULTIES), _setting("of generated levels", min(DIFFICULTIES), max(DIFFICULTIES))),
     "level_file": ("", _setting("levels in the Boxoban format; empty: they are generated")),
@@ -77,7 +77,7 @@ class SimulatorNode(GraphNode):
 
     Parameters:
         seed, episodes, difficulty, level_file: Which episodes are played, see `mujoban_sokoban.episodes.Episodes`;
-            `episodes` 0 means as many as a level file has, else one.
+            `seed` -1 and `episodes` 0 mean what None does there.
         time_limit: Steps of an episode; 0 means that of the body.
         body, world: The robot's body, and the physical world, see `mujoban_sim.presets`.
         realtime: Simulated seconds per second; 0 is lockstep.
@@ -160,10 +160,10 @@ class SimulatorNode(GraphNode):
         return 0.0 if self._started is None else time.perf_counter() - self._started
 
     def _read_episodes(self) -> Episodes:
-        level_file = self._settings["level_file"]
+        level_file, seed = self._settings["level_file"], self._settings["seed"]
         return Episodes(
             self._settings["episodes"] or None,
-            self._settings["seed"],
+            None if seed < 0 else seed,
             difficulty=self._settings["difficulty"],
             level_file=Path(level_file) if level_file else None,
         )

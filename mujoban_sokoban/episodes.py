@@ -13,7 +13,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_sokoban.generator import check_difficulty, check_seed, generate_level
+from mujoban_sokoban.generator import PLAY_SEEDS, check_difficulty, check_seed, generate_level
 from mujoban_sokoban.levels import Level, read_levels
 from mujoban_sokoban.rules import apply
 
@@ -117,13 +117,18 @@ class Episodes(LazyEpisodes):
     """
 
     def __init__(
-        self, count: int | None, seed: int, *, difficulty: int = max(DIFFICULTIES), level_file: Path | None = None
+        self,
+        count: int | None,
+        seed: int | None,
+        *,
+        difficulty: int = max(DIFFICULTIES),
+        level_file: Path | None = None,
     ) -> None:
         """Describe the run.
 
         Args:
             count: Number of episodes; None means one, or as many as a level file has levels.
-            seed: Seed of episode 0, not negative.
+            seed: Seed of episode 0, not negative; None: the first of `PLAY_SEEDS`, or of a file the first level.
             difficulty: 1 to 5, for generated levels.
             level_file: Levels in the Boxoban format.
 
@@ -133,6 +138,8 @@ class Episodes(LazyEpisodes):
             OSError: If it cannot be read.
         """
         self.source = LevelSource.make(difficulty, level_file)
+        if seed is None:
+            seed = 0 if self.source.levels else PLAY_SEEDS.start
         check_seed(seed)
         if count is not None and count < 1:
             raise ValueError(f"{count} episodes: expected at least 1")

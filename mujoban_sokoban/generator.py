@@ -24,11 +24,13 @@ from mujoban_sokoban.bitboard import NONE, SIDE, SQUARES, Bits, Int, bit, count,
 from mujoban_sokoban.levels import Level, LevelBatch
 
 TEST_SEEDS: Final = range(0, 5_000_000)
-"""Seeds of results, and of what users play: never of training, and for tuning there are others."""
+"""Seeds of results: never of training, and for tuning and playing there are others."""
 VALIDATION_SEEDS: Final = range(5_000_000, 10_000_000)
 """Seeds for tuning: to be looked at as often as one likes."""
 FRESH_SEEDS: Final = range(7_000_000, 8_000_000)
 """Those of validation by which no trainer chooses what it keeps: what `make weights` reports is measured on them."""
+PLAY_SEEDS: Final = range(9_500_000, 10_000_000)
+"""Those of validation by which nothing is chosen: what is played where nobody gives a seed."""
 TRAIN_SEEDS: Final = range(10_000_000, 2**62)
 """Seeds of training."""
 

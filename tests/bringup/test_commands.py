@@ -25,7 +25,7 @@ from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.bags.training import episode_ticks, open_training_bag
 from mujoban_msgs_py.topics import GRAPH_TOPICS
 from mujoban_sim import rendering
-from mujoban_sokoban.generator import TRAIN_SEEDS
+from mujoban_sokoban.generator import PLAY_SEEDS, TRAIN_SEEDS
 from mujoban_sokoban.levels import Level, write_levels
 
 
@@ -47,10 +47,13 @@ def test_run_stack_plays_records_films_and_reports(tmp_path, capfd):
     assert film["duration"] >= 0.05 * sum(e["steps"] for e in content["episodes"])
 
 
-def test_run_stack_shows_instruction_estimate_and_truth(capfd):
-    assert run(run_stack, "--difficulty", 1, *ALL_ORACLES) == 0
+def test_run_stack_shows_instruction_estimate_and_truth_on_a_level_that_is_none_for_tests(tmp_path, capfd):
+    report = tmp_path / "report.json"
+    assert run(run_stack, "--difficulty", 1, *ALL_ORACLES, "--json", report) == 0
     out = capfd.readouterr().out
     assert "instruction" in out and "estimate" in out and "ground truth" in out and "solved 1 of 1" in out
+    content = json.loads(report.read_text())
+    assert content["played"]["seed"] == PLAY_SEEDS.start and "test_uses" not in content
 
 
 @pytest.mark.parametrize(
@@ -279,11 +282,9 @@ def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capf
 
 
 def test_levels_that_are_not_for_training_are_recorded_only_when_that_is_asked_for():
-    assert recorded_seed(None, records=False, allow_test_seeds=False) == 0
-    assert recorded_seed(7, records=False, allow_test_seeds=False) == 7
-    assert recorded_seed(None, records=True, allow_test_seeds=False) in TRAIN_SEEDS
-    assert recorded_seed(7, records=True, allow_test_seeds=True) == 7
-    assert recorded_seed(10_000_000, records=True, allow_test_seeds=False) == 10_000_000
+    assert recorded_seed(None, allow_test_seeds=False) in TRAIN_SEEDS
+    assert recorded_seed(7, allow_test_seeds=True) == 7
+    assert recorded_seed(10_000_000, allow_test_seeds=False) == 10_000_000
     for seed in (7, 5_000_000, 9_999_999):
         with pytest.raises(ValueError, match=r"expected one from 10000000 on .* or --allow-test-seeds"):
-            recorded_seed(seed, records=True, allow_test_seeds=False)
+            recorded_seed(seed, allow_test_seeds=False)

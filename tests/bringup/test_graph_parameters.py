@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 
 from bringup.command import Choice, Stack
 from bringup.graph_recorder import RecorderNode
-from bringup.parameters import graph_parameters, write_parameters
+from bringup.parameters import graph_parameters, read_parameters, write_parameters
 from mujoban_controller import teacher_weights
 from mujoban_controller.node import ControllerNode
 from mujoban_estimator.estimator import StateEstimator
@@ -19,6 +19,7 @@ from mujoban_planner.deliberation import Deliberation
 from mujoban_rl.weights import save_weights
 from mujoban_sim.node import PARAMETERS, SimulatorNode
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import PLAY_SEEDS
 
 
 def test_weights_are_loaded_while_the_graph_runs_and_bad_ones_are_refused(play_graph, oracles, fresh_weights, tmp_path):
@@ -135,6 +136,16 @@ def test_a_setting_out_of_its_range_is_refused_with_the_reason(
 def test_a_simulator_is_not_made_with_a_parameter_out_of_its_range(name, value):
     with pytest.raises(InvalidParameterValueException, match=rf"(?s)\b{name}\b.*range"):
         SimulatorNode(parameter_overrides=[Parameter(name, value=value)])
+
+
+@pytest.mark.usefixtures("ros")
+def test_a_simulator_that_is_given_no_seed_plays_none_of_the_levels_for_tests():
+    for defaults in ({}, read_parameters()["simulator"]):
+        simulator = SimulatorNode(parameter_overrides=[Parameter(name, value=v) for name, v in defaults.items()])
+        try:
+            assert simulator.episodes.seed in PLAY_SEEDS
+        finally:
+            simulator.destroy_node()
 
 
 def test_every_parameter_of_the_simulator_and_the_recorder_says_what_it_means(play_graph, tmp_path):
