@@ -31,6 +31,7 @@ from mujoban_core.plugins import (
     load_scout,
     shipped_weights,
 )
+from mujoban_core.program import say
 from mujoban_planner.deliberation import Deliberation
 
 if TYPE_CHECKING:
@@ -218,6 +219,8 @@ Player = Stack | Solo
 def recorded_seed(seed: int | None, *, allow_test_seeds: bool) -> int:
     """Return the seed of the first episode of a recording: of those for training where nobody says otherwise.
 
+    That test levels are recorded is said on stderr.
+
     Args:
         seed: As given on the command line; None where it was not.
         allow_test_seeds: Whether episodes may be recorded though they are not for training.
@@ -225,7 +228,7 @@ def recorded_seed(seed: int | None, *, allow_test_seeds: bool) -> int:
     Raises:
         ValueError: If they are not for training and that is not allowed.
     """
-    from mujoban_sokoban.generator import TRAIN_SEEDS
+    from mujoban_sokoban.generator import TEST_SEEDS, TRAIN_SEEDS
 
     if seed is None:
         return TRAIN_SEEDS.start
@@ -234,6 +237,8 @@ def recorded_seed(seed: int | None, *, allow_test_seeds: bool) -> int:
             f"--seed {seed}: its levels are not for training; expected one from {TRAIN_SEEDS.start} on for a "
             "recording, or --allow-test-seeds"
         )
+    if seed in TEST_SEEDS:
+        say(f"test levels are recorded, from seed {seed} on, and this is written nowhere but in the bags")
     return seed
 
 

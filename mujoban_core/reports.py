@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from mujoban_core.files import write_atomically
+from mujoban_core.program import say
 
 
 def count_uses(uses: Iterable[Mapping[str, Any]]) -> int:
@@ -67,9 +68,16 @@ def write_report(content: Mapping[str, Any], path: Path, *, indent: int | None =
     write_atomically(path, (json.dumps(content, indent=indent) + "\n").encode())
 
 
+def say_unwritten_use(report: Mapping[str, Any]) -> None:
+    """Say on stderr which test levels a report that no file takes is of, if any: of their use nothing is left."""
+    for first, last in (use["seeds"] for use in report.get("test_uses", ())):
+        say(f"test levels were used, seeds {first} to {last}, and this is written nowhere: --json FILE notes it")
+
+
 def give_report(report: Mapping[str, Any], file: Path | None) -> None:
     """Print a report as JSON, or write it to a file if there is one."""
     if file is None:
         print(json.dumps(report, indent=2))
+        say_unwritten_use(report)
     else:
         write_report(report, file)

@@ -281,9 +281,12 @@ def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capf
     assert json.loads(report.read_text())["played"]["look_around"] == 5
 
 
-def test_levels_that_are_not_for_training_are_recorded_only_when_that_is_asked_for():
+def test_levels_that_are_not_for_training_are_recorded_only_when_that_is_asked_for(capsys):
     assert recorded_seed(None, allow_test_seeds=False) in TRAIN_SEEDS
+    assert recorded_seed(5_000_000, allow_test_seeds=True) == 5_000_000
+    assert not capsys.readouterr().err
     assert recorded_seed(7, allow_test_seeds=True) == 7
+    assert capsys.readouterr().err.startswith("test levels are recorded, from seed 7 on")
     assert recorded_seed(10_000_000, allow_test_seeds=False) == 10_000_000
     for seed in (7, 5_000_000, 9_999_999):
         with pytest.raises(ValueError, match=r"expected one from 10000000 on .* or --allow-test-seeds"):

@@ -64,6 +64,7 @@ def test_a_summary_on_the_terminal_names_lost_seeds_by_cause(capfd):
         assert cause == "lost by time limit: 2 (seeds 1000, 1001)"
         assert privileged.startswith("privileged, told the ground truth: estimator: oracle")
         assert "2 of 2 episodes ended" in captured.err
+        assert captured.err.count("test levels were used, seeds 1000 to 1001, and this is written nowhere: --json") == 1
 
 
 def test_an_interrupted_evaluation_reports_what_it_has(tmp_path):
@@ -123,7 +124,8 @@ def test_what_was_played_before_an_error_is_reported_and_that_test_levels_were_u
         raise OSError("the disk is full")
     content = json.loads((tmp_path / "report.json").read_text())
     assert content["interrupted"] == 4 and content["test_uses"][0]["seeds"] == [1000, 1000]
-    assert capfd.readouterr().out.count("solved 1 of 1") == 1
+    told = capfd.readouterr()
+    assert told.out.count("solved 1 of 1") == 1 and "written nowhere" not in told.err
 
 
 def test_of_a_file_only_the_levels_that_are_played_are_looked_through(tmp_path, monkeypatch, capsys):

@@ -34,6 +34,23 @@ def test_evaluating_a_module_on_test_levels_is_noted_with_what_was_noted_before(
     assert "test_uses" not in json.loads(report.read_text()), "a report on other levels is another one"
 
 
+@pytest.mark.parametrize(
+    ("main", "options"),
+    [(planner.main, ()), (controller.main, ("--driver", "scripted"))],
+    ids=["planner", "controller"],
+)
+def test_a_use_of_test_levels_that_no_file_takes_is_said(
+    main: Callable[[Sequence[str]], int], options: Sequence[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ["--difficulty", "1", "--episodes", "2", *options]
+    assert main([*few, "--seed", "1000"]) == 0
+    said = "test levels were used, seeds 1000 to 1001, and this is written nowhere: --json FILE notes it"
+    assert capsys.readouterr().err.splitlines().count(said) == 1
+    assert main([*few, "--seed", "1000", "--json", str(tmp_path / "report.json")]) == 0
+    assert main([*few, "--seed", "5000000"]) == 0
+    assert "test levels" not in capsys.readouterr().err
+
+
 def test_parts_of_an_evaluation_are_one_use_and_each_further_look_at_a_level_is_another() -> None:
     def use(first: int, last: int, planner: str = "a", **other: Any) -> dict[str, Any]:
         game = {"seed": first, "difficulty": 5}
