@@ -61,6 +61,35 @@ def test_a_documented_command_exists_and_understands_its_options(command, monkey
     assert ended.type is Read or "--help" in arguments
 
 
+SMALL = {
+    "bringup.record": "--episodes 2 --difficulty 1 --processes 1 --look-around 3 --look-ahead 0 --time-limit 40",
+    "mujoban_estimator.train": "--steps 1 --streams 1 --length 8 --workers 0",
+    "mujoban_planner.train imitation": "--samples 4 --batch-size 4",
+    "mujoban_planner.train mpo": "--updates 1 --batch-size 4",
+    "mujoban_controller.train --stage distil": "--steps 64 --evaluation-episodes 0 --distil.first 16 "
+    "--distil.windows 2",
+    "mujoban_controller.train --stage mpo": "--steps 64 --evaluation-episodes 0 --asymmetric.first 64 "
+    "--asymmetric.windows 2 --asymmetric.critic-first 1 --asymmetric.critic-windows 2",
+}
+"""Budgets of a moment for each kind of command in the round of docs/bags.md."""
+
+
+def test_the_round_through_bags_trains_every_module_as_it_is_printed(tmp_path, monkeypatch):
+    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
+    monkeypatch.chdir(tmp_path)
+    for package in ("mujoban_estimator", "mujoban_planner", "mujoban_controller"):
+        (tmp_path / package / "weights").parent.mkdir()
+        (tmp_path / package / "weights").symlink_to(ROOT / package / "weights")
+    walked = []
+    for command in commands(ROOT / "docs" / "bags.md"):
+        module, arguments = program(shlex.split(command, comments=True))
+        (kind,) = (kind for kind in SMALL if " ".join([module, *arguments]).startswith(kind))
+        walked.append(kind)
+        assert importlib.import_module(module).main([*arguments, *SMALL[kind].split()]) == 0, command
+    assert set(walked) == set(SMALL) and walked[-1] == "bringup.record"
+    assert len(list((tmp_path / "bags" / "round2").iterdir())) == 2
+
+
 def test_commands_in_fences_in_steps_of_a_list_and_in_tables_are_read_too():
     found = {page.name: " ".join(commands(page)) for page in GUIDES}
     assert "--stage distil" in found["controller.md"] and "mujoban_estimator.evaluate" in found["estimator.md"]
