@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical
 
-from mujoban_core.ranges import check_counts, check_positive, check_shares
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_planner.boards import BitBoards
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.product import PlannerLearner
@@ -57,7 +57,7 @@ class PushPPOConfig(PushRunConfig):
         """Reject numbers with which nothing is learned, and what is no share."""
         super().__post_init__()
         check_counts(self, "epochs", "minibatch")
-        check_counts(self, "entropy", least=0)
+        check_not_negative(self, "entropy")
         check_positive(self, "learning_rate")
         check_shares(self, "discount", "decay", "warm_up")
 

@@ -305,6 +305,7 @@ def test_every_method_has_a_budget_of_cpu_seconds_and_evaluations_by_samples(tmp
         ("mpo-pushes", "--environments", "0"),
         ("ppo", "--minibatch", "0"),
         ("ppo", "--discount", "1.5"),
+        ("ppo", "--entropy", "inf"),
         ("ppo", "--channels", "0"),
         ("expert-iteration", "--trees", "0"),
         ("expert-iteration", "--questions", "-1"),
