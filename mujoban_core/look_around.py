@@ -126,7 +126,8 @@ class LookAroundPlanner(Planner):
                 until[i] = 0
             elif told[i] != Instruction.STAY:
                 seen[i] |= walk_view(abstract_state[i], Instruction(told[i]), self.body)
-            step = None if walks[i] == 0 else self.scout.step(abstract_state[i], seen[i])
+            # Copies: what a scout writes changes nothing that the planner goes by, and no other robot's is behind them.
+            step = None if walks[i] == 0 else self.scout.step(abstract_state[i].copy(), seen[i].copy())
             if step is None:
                 ready[i] = True
                 continue

@@ -1,7 +1,13 @@
-"""Modules that try to cheat: a plugin for each role that collects whatever it can reach of the truth."""
+"""Plugins that try to cheat: one for each role, a scout and an agent, which collect what they can reach of the truth.
+
+They ask too late, or otherwise than they said, look at every field that they are given and at what lies behind it, keep
+it, and write into it. What docs/security.md leaves to the user is not tried: the interpreter's memory (`gc`, frames),
+other processes and files, a node of one's own, and levels made from guessed seeds.
+"""
 
 import sys
 import textwrap
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -22,7 +28,7 @@ from bringup.stack import PlayOptions, play
 from bringup.view import live_view
 from mujoban_core import plugins
 from mujoban_core.interfaces import module_seeds
-from mujoban_core.plugins import AGENT, ROLES
+from mujoban_core.plugins import AGENT, ROLES, SCOUT
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.conversions import InstructionReading, TerminationReading
 from mujoban_msgs_py.runtime.module_node import ModuleNode
@@ -31,9 +37,9 @@ from mujoban_sokoban.episodes import Episodes
 
 CHEATERS = """
 import numpy as np
-from mujoban_core import agent, interfaces
+from mujoban_core import agent, interfaces, look_around
 
-FOUND = {"seeds": [], "truth": [], "fields": set(), "behind": [], "kept": []}
+FOUND = {"seeds": [], "truth": [], "fields": set(), "behind": [], "kept": [], "scouted": []}
 
 def behind(thing):
     # What leads on from something that a module is given: fields, attributes, the memory of arrays.
@@ -102,13 +108,22 @@ class Flickering(Controller):
     def privileged(self, value):
         pass
 
-class Sly(agent.Agent):
-    privileged = False
+class Deciding(Termination):
+    def probability(self, inputs, memory):
+        return super().probability(inputs, memory)[0] + 1, memory
+
+class Scout(Cheat, look_around.Scout):
+    def step(self, abstract_state, shown):
+        FOUND["truth"].append(abstract_state if abstract_state.any() else None)
+        FOUND["scouted"].append(abstract_state.shape)
+        self.search([abstract_state, shown])
+        return None
+
+class Sly(Cheat, agent.Agent):
     sees = ("pose", "abstract_state")
-    def initial_memory(self, batch):
-        return ()
     def step(self, inputs, state):
         FOUND["truth"].append(inputs.abstract_state)
+        self.search(behind(inputs))
         return np.zeros((len(inputs.pose), 2), np.float32), state
 
 class Growing(Sly):
@@ -131,9 +146,14 @@ def cheaters(tmp_path, monkeypatch):
     del sys.modules["cheaters"]
 
 
-def stack(**others):
+def stack(*, look_around=0, **others):
     names = {role: role.capitalize() for role in ROLES} | others
-    return Stack({role: Choice(role, f"cheaters:{name}") for role, name in names.items()}, look_around=0)
+    choices = {role: Choice(role, f"cheaters:{name}") for role, name in names.items()}
+    return Stack(choices, look_around=look_around, scout=Choice(SCOUT, "cheaters:Scout"))
+
+
+def solo(name):
+    return Solo(Choice(AGENT, f"cheaters:{name}"))
 
 
 def check_found(cheaters, episodes):
@@ -148,17 +168,30 @@ def check_found(cheaters, episodes):
     assert not {spec.seed for spec in episodes} & {seed for seeds in found["seeds"] for seed in seeds.tolist()}
 
 
-@pytest.mark.parametrize(("seed", "controller"), [(7, "Controller"), (123, "Flickering")])
-def test_in_a_rollout_a_cheating_plugin_finds_nothing(cheaters, seed, controller):
+@pytest.mark.parametrize(
+    ("seed", "player"),
+    [(7, stack), (123, partial(stack, controller="Flickering")), (123, partial(solo, "Growing"))],
+    ids=["modules", "flickering", "agent"],
+)
+def test_in_a_rollout_a_cheating_plugin_finds_nothing(cheaters, seed, player):
     episodes = Episodes(2, seed, difficulty=1)
     world, untouched = (World(1, max_boxes=1, time_limit=6) for _ in range(2))
-    results = rollout(stack(controller=controller).policy(), world, episodes)
+    results = rollout(player().policy(), world, episodes)
     assert not any(result.solved for result in results)
     check_found(cheaters, episodes)
     untouched.reset([0], [episodes[1]])
     for _ in range(6):
         untouched.step(np.zeros((1, 2), np.float32))
     assert np.array_equal(world.pose, untouched.pose), "what a plugin writes into its inputs moves nothing"
+
+
+def test_a_cheating_scout_finds_nothing_and_changes_nothing_that_the_planner_goes_by(cheaters, play_graph):
+    looking, episodes = stack(look_around=1, termination="Deciding"), Episodes(2, 123, difficulty=1)
+    rollout(looking.policy(), World(2, max_boxes=1, time_limit=6), episodes)
+    alone = len(cheaters.FOUND["scouted"])
+    play_graph(looking, episodes, time_limit=6).finish()
+    assert 0 < alone < len(cheaters.FOUND["scouted"]) and set(cheaters.FOUND["scouted"]) == {(10, 10, 4)}
+    check_found(cheaters, episodes)
 
 
 @pytest.mark.parametrize("controller", ["Controller", "Flickering"])
@@ -210,16 +243,16 @@ def test_an_instance_that_asks_otherwise_than_the_one_that_reports_name_does_not
 
 
 def test_an_agent_that_denies_what_it_sees_is_named_by_it(cheaters):
-    sly = Solo(Choice(AGENT, "cheaters:Sly"))
+    sly = solo("Sly")
     assert sly.identities() == {AGENT: "cheaters:Sly (privileged)"} and sly.policy().privileged
-    episodes = Episodes(1, 123, difficulty=1)
-    growing = Solo(Choice(AGENT, "cheaters:Growing"))
+    episodes = Episodes(2, 123, difficulty=1)
+    growing = solo("Growing")
     assert growing.identities() == {AGENT: "cheaters:Growing"}
     assert play(growing, episodes, PlayOptions(time_limit=6)).results == evaluate(
         growing.policy(), episodes, time_limit=6
     )
-    check = cheaters.FOUND["truth"]
-    assert len(check) == 12 and all(truth is None for truth in check)
+    assert len(cheaters.FOUND["truth"]) == 18
+    check_found(cheaters, episodes)
 
 
 def test_what_a_distribution_calls_scripted_is_named_by_what_it_asks_for(cheaters, monkeypatch):
