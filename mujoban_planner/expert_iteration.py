@@ -88,4 +88,4 @@ def expert_iteration(
     }
     budget = Budget(cpu_seconds=config.cpu_seconds, seconds=config.horizon_seconds, updates=config.updates)
     run = RunDirectory(directory, config)
-    return Trainer(run, ImitationLearner(config, device), source, budget, cadence, record=record)
+    return Trainer(run, ImitationLearner(config, config.search, device), source, budget, cadence, record=record)

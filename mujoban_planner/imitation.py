@@ -23,6 +23,7 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.product import PlannerLearner
 from mujoban_planner.samples import Batch
 from mujoban_planner.teacher import HOPELESS
+from mujoban_planner.uncertainty import UncertaintyConfig
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Budget, Cadence, Source, State, Trainer
@@ -139,11 +140,24 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> t
 
 
 class ImitationLearner(PlannerLearner[Batch]):
-    """Trains a network on lessons; the moving average of its weights is what is played and shipped."""
+    """Trains a network on lessons; the moving average of its weights is what is played and shipped.
 
-    def __init__(self, config: LearnerConfig, device: torch.device | str = "cpu") -> None:
-        """Make the network."""
+    Which average solves the most levels that are seen whole does not tell which does best on estimates: where lessons
+    show these, the last one is exported.
+    """
+
+    def __init__(
+        self, config: LearnerConfig, uncertainty: UncertaintyConfig, device: torch.device | str = "cpu"
+    ) -> None:
+        """Make the network.
+
+        Args:
+            config: How it learns.
+            uncertainty: How lessons show states.
+            device: Device of the network.
+        """
         super().__init__()
+        self.chooses = not uncertainty.shows_estimates
         self.config, self.device = config, usable_device(device)
         torch.manual_seed(config.seed)  # the initial weights
         self.network = beginning(config, config.init).to(self.device)
@@ -214,7 +228,7 @@ def imitation(
         BagError: If a bag is not what is expected.
     """
     run = RunDirectory(directory, config)
-    learner = ImitationLearner(config, device)
+    learner = ImitationLearner(config, config, device)
     source = _source(config, actors or ActorOptions(), bags, device)
     record = {
         **provenance(),

@@ -18,19 +18,23 @@ BatchT = TypeVar("BatchT")
 class PlannerLearner(JudgedLearner[BatchT]):
     """A learner whose product is a planner: what solves the most held-out levels, alone, is exported."""
 
+    chooses: bool = True
+    """Whether held-out levels, which are seen whole, tell which planner is best; otherwise the newest counts."""
+
     @property
     @abstractmethod
     def product(self) -> LearnedPlanner:
         """The planner that the run is for, as it is now."""
 
     def evaluate(self) -> dict[str, float]:
-        """Return the planner's solve rates, alone, on held-out levels; keep it if it is the best."""
+        """Return the planner's solve rates, alone, on held-out levels; keep it if that makes it the best."""
         product = self.product
         training = product.training
         product.eval()
         rates = success_rates(product)
         product.train(training)
-        self.best.judge(product, tuple(rates.values()), rates)
+        if self.chooses:
+            self.best.judge(product, tuple(rates.values()), rates)
         return rates
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:

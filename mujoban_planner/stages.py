@@ -1,7 +1,7 @@
 """Several methods one after the other, each from the weights of the one before: `... mujoban_planner.train stages`.
 
-What ends up as their planner is the best of all stages on held-out levels: each keeps what it begins with until it has
-made something better.
+What ends up as their planner is the best of all stages on held-out levels: each keeps what it begins with while what it
+makes is worse. Imitation, whose lessons show estimates, hands on its last.
 """
 
 from __future__ import annotations

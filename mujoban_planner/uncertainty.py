@@ -92,6 +92,11 @@ class UncertaintyConfig:
     errors: float = 0.0
     """Times as often as measured that what the robot has seen is wrong in these states: 1 is as measured, 0 never."""
 
+    @property
+    def shows_estimates(self) -> bool:
+        """Whether some states are shown as an estimator sees them."""
+        return bool(self.noise or self.hidden)
+
     def __post_init__(self) -> None:
         """Reject what is no share, and no factor."""
         check_shares(self, "noise", "hidden")

@@ -134,9 +134,11 @@ def test_every_method_exports_the_planner_that_solved_most_held_out_levels(
     resumed = make()
     resumed.learner.export(resumed.directory, {})
     file = tmp_path / "planner.safetensors"
-    assert float(load(file, compiled=False).encoder.weight.detach().max()) == 1.0
+    # Imitation's lessons show estimates, of which levels that are seen whole tell nothing: the newest counts.
+    value, *told = (2.0, None, None) if method == "imitation" else (1.0, rates[0], 0)
+    assert float(load(file, compiled=False).encoder.weight.detach().max()) == value
     record = read_record(file)
-    assert (record["validation"], record["evaluation"]) == (rates[0], 0)
+    assert [record["validation"], record["evaluation"]] == told
 
 
 @pytest.mark.parametrize("method", sorted(stages.METHODS))
