@@ -228,7 +228,7 @@ def _controller(options: Options) -> list[Stage]:
     return [
         _trainer(
             options, "teacher", (train, "--stage", "teacher", *common, *method, *begun), teacher,
-            beside=[PRODUCTS[product] for product in [*made.values()][1:]], sources=_sources(options, *made.values()),
+            beside=[PRODUCTS["critic"]] if options.has_critic else [], sources=_sources(options, *made.values()),
         ),
         _trainer(
             options, "controller_distil", (train, "--stage", "distil", "--teacher", str(run / teacher), *common,
