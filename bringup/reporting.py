@@ -12,7 +12,7 @@ from bringup.options import EpisodeOptions
 from bringup.results import EpisodeResult, report, summary
 from mujoban_core.bodies import get_body
 from mujoban_core.files import digest
-from mujoban_core.reports import say_unwritten_use, write_report
+from mujoban_core.reports import keep_report
 from mujoban_core.signals import StopSignal
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import seed_range
@@ -95,10 +95,7 @@ class Reporting:
             seeds = [entry["seed"] for entry in content["episodes"]]
             content |= noted_use(seeds, self._weights, content["played"])
         print(*summary(content), sep="\n", flush=True)
-        if self._path is None:
-            say_unwritten_use(content)
-        else:
-            write_report(content, self._path)
+        keep_report(content, self._path)
 
     def __enter__(self) -> Self:
         """Return the report itself."""

@@ -68,8 +68,11 @@ def write_report(content: Mapping[str, Any], path: Path, *, indent: int | None =
     write_atomically(path, (json.dumps(content, indent=indent) + "\n").encode())
 
 
-def say_unwritten_use(report: Mapping[str, Any]) -> None:
-    """Say on stderr which test levels a report that no file takes is of, if any: of their use nothing is left."""
+def keep_report(report: Mapping[str, Any], file: Path | None) -> None:
+    """Write a report to a file if there is one; otherwise say on stderr which uses of test levels are noted nowhere."""
+    if file is not None:
+        write_report(report, file)
+        return
     for first, last in (use["seeds"] for use in report.get("test_uses", ())):
         say(f"test levels were used, seeds {first} to {last}, and this is written nowhere: --json FILE notes it")
 
@@ -78,6 +81,4 @@ def give_report(report: Mapping[str, Any], file: Path | None) -> None:
     """Print a report as JSON, or write it to a file if there is one."""
     if file is None:
         print(json.dumps(report, indent=2))
-        say_unwritten_use(report)
-    else:
-        write_report(report, file)
+    keep_report(report, file)

@@ -19,7 +19,7 @@ from mujoban_core.files import check_file, digest
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.program import read_options, run_command
 from mujoban_core.ranges import check_counts
-from mujoban_core.reports import say_unwritten_use, write_report
+from mujoban_core.reports import keep_report
 from mujoban_core.stats import wilson_interval
 from mujoban_core.threads import set_threads
 from mujoban_planner import SHIPPED, load
@@ -153,10 +153,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     print(f"decisions per second  {result['decisions_per_second']:.0f}")
     if options.look_ahead:
         print(f"evaluations per level {result['evaluations_per_level']:.1f}  (at most {options.look_ahead} per search)")
-    if options.json is None:
-        say_unwritten_use(result)
-    else:
-        write_report(result, options.json)
+    keep_report(result, options.json)
     return 0
 
 
