@@ -12,7 +12,6 @@ from mujoban_controller.policy import GoalPolicy
 from mujoban_rl.best import JudgedLearner
 from mujoban_rl.engine import Scalars
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import save_weights
 from mujoban_sim.oracles import OraclePlanner
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sokoban.generator import VALIDATION_SEEDS
@@ -78,4 +77,4 @@ class ProductLearner(JudgedLearner[BatchT]):
         """
         product = self.product
         file = directory.path / f"{product.file_name}.safetensors"
-        save_weights(file, self.best.chosen(product), product.config, {**record, **self.best.told})
+        self.best.save(file, product, product.config, record)

@@ -34,7 +34,7 @@ from mujoban_rl.losses.mpo_discrete import DiscreteMPOConfig
 from mujoban_rl.optimise import ProgressSchedule, warm_up_cosine
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import provenance, save_weights
+from mujoban_rl.weights import provenance
 
 _JUDGED: Final = 128
 """Validation levels of an evaluation."""
@@ -186,8 +186,7 @@ class ExplorerLearner(DiscreteMPOLearner):
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the target network that has earned most, or the present one, with its record."""
-        file, target = directory.path / "explorer.safetensors", self.target
-        save_weights(file, self.best.chosen(target), target.config, {**record, **self.best.told})
+        self.best.save(directory.path / "explorer.safetensors", self.target, self.target.config, record)
 
 
 def explore(

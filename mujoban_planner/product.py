@@ -10,7 +10,6 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.validation import success_rates
 from mujoban_rl.best import JudgedLearner
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import save_weights
 
 BatchT = TypeVar("BatchT")
 
@@ -40,5 +39,4 @@ class PlannerLearner(JudgedLearner[BatchT]):
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the best planner, or the present one where none was judged, with its record."""
         product = self.product
-        file = directory.path / "planner.safetensors"
-        save_weights(file, self.best.chosen(product), product.config, {**record, **self.best.told})
+        self.best.save(directory.path / "planner.safetensors", product, product.config, record)

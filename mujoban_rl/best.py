@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import deepcopy
+from pathlib import Path
 from typing import Any, TypeVar
 
 from torch import Tensor, nn
 
 from mujoban_rl.engine import Learner, Scalars, State
+from mujoban_rl.weights import save_weights
 
 BatchT = TypeVar("BatchT")
 ProductT = TypeVar("ProductT", bound=nn.Module)
@@ -42,6 +45,10 @@ class Best:
         chosen = deepcopy(product)
         chosen.load_state_dict(self._weights or product.state_dict())
         return chosen
+
+    def save(self, file: Path, product: nn.Module, config: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+        """Write what `chosen` returns, as `save_weights` does, with what is `told` of it in its record."""
+        save_weights(file, self.chosen(product), config, {**record, **self.told})
 
     @property
     def told(self) -> dict[str, Any]:
