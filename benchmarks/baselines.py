@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 
 from benchmarks.command import run_benchmark
 from benchmarks.paper.baselines import BASELINES
-from mujoban_baselines.train import COMMANDS, MonolithicMPO, MPORunConfig, mpo_parts
+from mujoban_baselines.train import COMMANDS, MPO_PACE, MonolithicMPO, MPORunConfig, mpo_parts
 from mujoban_core.program import read_options
 from mujoban_core.threads import set_threads
 from mujoban_rl.actors import ActorOptions
@@ -26,8 +26,6 @@ from mujoban_rl.limits import NaNGuard
 from mujoban_rl.precision import bfloat16_pays
 
 _ROW: Final = "mpo_hard"
-_PUBLISHED: Final = 5
-"""Updates between two publications of the weights, as in training."""
 
 
 class Rate(NamedTuple):
@@ -59,7 +57,7 @@ def rate(config: MPORunConfig, actors: ActorOptions, seconds: float) -> Rate:
         """Learn for ever; yield time, CPU time and steps so far whenever actors have delivered some thousand steps."""
         steps = 0
         for update in itertools.count():
-            if update % _PUBLISHED == 0:
+            if update % MPO_PACE["publish_updates"] == 0:
                 source.publish(learner.weights(), update)
             batch = source.next_batch()
             if update and source.samples > steps:

@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import torch
@@ -47,6 +47,8 @@ from mujoban_rl.weights import load_weights, origin, provenance
 from mujoban_sim.presets import DEFAULT_WORLD
 
 PROG = "mujoban_baselines.train"
+MPO_PACE: Final = {"log_updates": 50, "publish_updates": 5}
+"""How often a run of MPO logs and publishes."""
 Size = Literal["S", "M", "L"]
 
 
@@ -264,7 +266,7 @@ class MonolithicMPO(_Command):
     def trainer(self) -> Trainer[Any]:
         """Make or resume the run."""
         parts, start = mpo_parts(self.config, self.actors), origin(self.config.start)
-        return make_trainer(self.config, parts, self.run, self.cadence(50, 5), "monolithic-mpo", start=start)
+        return make_trainer(self.config, parts, self.run, self.cadence(**MPO_PACE), "monolithic-mpo", start=start)
 
 
 @dataclass(frozen=True)
@@ -320,7 +322,7 @@ class Joint(_Command):
         config = self.config
         parts = joint_parts(config.task, config.start, config.joint, config.seed, self.actors)
         start = config.start.digests(config.task.body)
-        return make_trainer(config, parts, self.run, self.cadence(50, 5), "joint", start=start)
+        return make_trainer(config, parts, self.run, self.cadence(**MPO_PACE), "joint", start=start)
 
 
 COMMANDS: dict[str, type[_Command]] = {

@@ -69,9 +69,8 @@ def difficulty(runs: Sequence[Run], file: Path, ahead: Run | None = None) -> boo
         if measured:
             rates = [report["success_rate"] for _, report in measured]
             bars = list(zip(*(margins(report) for _, report in measured), strict=True))
-            label = row.label
             x = [d for d, _ in measured]
-            axes.errorbar(x, rates, yerr=bars, capsize=2, marker=".", linewidth=1, label=label)
+            axes.errorbar(x, rates, yerr=bars, capsize=2, marker=".", linewidth=1, label=row.label)
     paper = [(run.difficulty, run.paper_success) for run, _ in reports if run.paper_success is not None]
     if paper:
         axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, its world", zorder=3)
