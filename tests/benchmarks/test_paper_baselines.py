@@ -1,0 +1,148 @@
+"""Table 1: what each of its agents is trained by, what that cost, and how it is shown."""
+
+import json
+
+import pytest
+from paper_pages import write
+
+from benchmarks.paper import __main__ as results
+from benchmarks.paper import baselines, parts, runs
+from bringup import train_all
+from mujoban_baselines.train import COMMANDS, PROG
+from mujoban_core.plugins import ROLES, load_module
+from mujoban_core.program import read_options
+
+
+def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, monkeypatch):
+    lines = [
+        {"step": 1000 * i, "cpu_seconds": 360.0 * i, "seconds": 180.0 * i, "solved/1": i / 10, "return/1": float(i),
+         "solved/1_n": 1 + i % 2, "return/1_n": 1, "solved/5": None}
+        for i in range(1, 11)
+    ]  # fmt: skip
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert baselines.main([f"mpo_easy={tmp_path / 'run'}"]) == 0
+    row = next(row for row in baselines.BASELINES if row.name == "mpo_easy")
+    cost = {"step": 10_000, "cpu_seconds": 3600, "seconds": 1800}
+    assert baselines.points_of(row)[-1] == {**cost, "solved": {"1": 1.0}, "return": {"1": 10.0}}
+    monkeypatch.setattr(baselines, "ROOT", tmp_path)  # whoever has trained the agent has other weights there
+    monkeypatch.setattr(baselines, "_MOST", 5)  # lines 9 and 10 are of 2 episodes and of 1
+    assert baselines.read_curve(tmp_path / "run")[-1]["solved"] == {"1": 0.9333}
+    write(row.run(1), 3, 4, {"agent": "a" * 64})
+    page = results.rebuild(folder).read_text()
+    rates = "75.0 % (30.1 to 95.4)" + 4 * " | not measured"
+    assert f"| MPO, asym. | o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 0.5 | 5 days, 256 actors | 4 | {rates} |" in page
+    assert (folder / "baselines.png").stat().st_size and "--agent" in row.run(1).options()
+    with pytest.raises(ValueError, match="nobody=x: expected NAME=RUN with a name among modular, mpo_hard"):
+        baselines.main(["nobody=x"])
+    row.curve.write_text("{}\n")
+    with pytest.raises(runs.ResultError, match=r"rerun python -m benchmarks\.paper\.baselines mpo_easy"):
+        results.rebuild(folder)
+
+
+def test_the_modular_row_has_a_cost_and_no_curve(folder):
+    cost = {"step": 1_000_000, "cpu_seconds": 7200, "seconds": 3600, "solved": {}, "return": {}}
+    baselines.MODULAR.curve.write_text(json.dumps(cost) + "\n")
+    page = results.rebuild(folder).read_text()
+    assert "| 1.00 M | 2.0 | 1.0 |" in page and "The curves of agents: not measured yet" in page
+    assert not (folder / "baselines.png").exists()
+
+
+def test_the_fine_tuned_stack_has_a_row_and_its_failures_beside_what_it_came_from(folder):
+    run = baselines.JOINT.run(5)
+    options = run.options()
+    for role in ("controller", "planner"):
+        assert options[options.index(f"--{role}") + 1] == str(runs.ROOT / f"runs/baselines/joint/{role}.safetensors")
+    write(runs.POLICY_ALONE[0], 3, 4, {})
+    write(run, 2, 4, {})
+    page = results.rebuild(folder).read_text()
+    assert "| modular, fine-tuned as a whole | o_cam, o_pr, o_pos |" in page and "50.0 % (15.0 to 85.0)" in page
+    failures = page.split("before fine-tuning as a whole and after")[1].split("##")[0]
+    assert "| default, the planner's policy alone |" in failures and "| modular, fine-tuned as a whole |" in failures
+
+
+def test_every_row_is_trained_by_a_command_that_exists_with_the_same_budget(folder):
+    page = results.rebuild(folder).read_text().splitlines()
+    for row in (*baselines.BASELINES, *baselines.AGAIN):
+        steps = cpu_seconds = 0.0
+        for command in row.commands:
+            assert f"    {command}" in page
+            _, _, program, *arguments = command.split()
+            if row is baselines.MODULAR:
+                assert program == train_all.PROG and read_options(train_all.Options, arguments, PROG).hours == 1.0
+                continue
+            options = read_options(COMMANDS, arguments, PROG)
+            assert program == PROG and isinstance(options, COMMANDS[arguments[0]])
+            assert options.config.seed == row.seed and options.run.name.startswith(row.name)
+            steps, cpu_seconds = steps + options.config.steps, cpu_seconds + options.config.cpu_seconds
+        whole = pytest.approx((baselines.steps(), 7200.0), abs=1.0)
+        assert row is baselines.MODULAR or row.agent or (steps, cpu_seconds) == whole
+
+
+def test_table_1_has_a_floor_that_is_measured_without_a_training(folder, monkeypatch):
+    measured = []
+    monkeypatch.setattr(parts, "evaluate", lambda run, options: measured.append(run))
+    assert runs.main(["--only", "untrained_1", "random_1"]) == 0
+    agents = [load_module("agent", run.options()[run.options().index("--agent") + 1]) for run in measured]
+    assert [run.name for run in measured] == ["random_1", "untrained_1"] and len(agents) == 2
+    write(measured[1], 1, 4, {"agent": "mujoban_baselines.agents:untrained"})
+    page = results.rebuild(folder).read_text()
+    cells = "o_cam, o_pr, o_pos | nothing | - | - | - | not there | 4 | 25.0 % (4.6 to 69.9) | not measured"
+    assert f"| MPO untrained: its noise, pink, held for 4 ticks | {cells}" in page
+    with pytest.raises(ValueError, match="random=x: expected NAME=RUN"):
+        baselines.main(["random=x"])
+
+
+def test_agents_get_the_steps_that_the_modular_row_took(folder):
+    assert "--steps 1250000" in baselines.JOINT.commands[0]
+    taken = {"step": 1_300_000, "cpu_seconds": 7000, "seconds": 3500, "solved": {}, "return": {}}
+    baselines.MODULAR.curve.write_text(json.dumps(taken))
+    assert "--steps 1300000" in baselines.JOINT.commands[0]
+
+
+def test_what_a_cloning_before_took_counts(folder, tmp_path):
+    for name, step in (("run_start", 300), ("run", 1000)):
+        (tmp_path / name).mkdir()
+        line = {"step": step, "cpu_seconds": step / 10, "seconds": step / 20}
+        (tmp_path / name / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    assert baselines.main([f"mpo_cloned={tmp_path / 'run'}"]) == 0
+    row = next(row for row in baselines.BASELINES if row.name == "mpo_cloned")
+    point = baselines.points_of(row)[-1]
+    assert (point["step"], point["cpu_seconds"], point["seconds"]) == (1300, 130, 65)
+    (tmp_path / "run_start" / "metrics.jsonl").write_text("")
+    with pytest.raises(runs.ResultError, match="run_start: its metrics are empty"):
+        baselines.main([f"mpo_cloned={tmp_path / 'run'}"])
+    (tmp_path / "run_start").rename(tmp_path / "elsewhere")
+    with pytest.raises(runs.ResultError, match=r"run_start: no metrics\.jsonl, expected the run directory"):
+        baselines.main([f"mpo_cloned={tmp_path / 'run'}"])
+
+
+def test_another_seed_of_a_row_is_shown_where_it_was_measured(folder):
+    assert "seed 1 |" not in results.rebuild(folder).read_text()
+    again = next(row for row in baselines.AGAIN if row.name == "mpo_easy_seed1")
+    again.curve.write_text(json.dumps({"step": 5, "cpu_seconds": 1, "seconds": 1, "solved": {}, "return": {}}))
+    write(again.run(1), 3, 4, {})
+    page = results.rebuild(folder).read_text()
+    assert "| MPO, asym., seed 1 | o_cam, o_pr, o_pos | easy |" in page and "75.0 % (30.1 to 95.4)" in page
+
+
+def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_path):
+    entry = {"command": ["-m", "x"], "done": True, "cpu_seconds": 3600.0, "spans": [[0.0, 1800.0]]}
+    (tmp_path / "pipeline.json").write_text(json.dumps({"teacher": entry, "bags_first": {**entry, "cpu_seconds": 0.0}}))
+    for name, file, text in (
+        ("teacher", "metrics.jsonl", '{"step": 5}\n{"step": 1000000}\n'),
+        ("logs", "bags_first.txt", "1 of 180 episodes recorded\n500000 ticks of 180 episodes in 32 bags\n"),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / file).write_text(text)
+    assert baselines.main([f"modular={tmp_path}"]) == 0
+    run = baselines.MODULAR.run(5)
+    options = run.options()
+    for role in ROLES:
+        weights = runs.ROOT / f"runs/baselines/modular/weights/{role}.safetensors"
+        assert options[options.index(f"--{role}") + 1] == str(weights)
+    write(run, 2, 4, {})
+    page = results.rebuild(folder).read_text()
+    cells = "1.50 M | 1.0 | 0.5 | 7 days, 200 to 1,000 actors a module | 4 |" + 4 * " not measured |"
+    cells += " 50.0 % (15.0 to 85.0)"
+    assert f"| modular | o_cam, o_pr, o_pos | all difficulties, bottom-up ([how](../weights.md)) | {cells} |" in page
