@@ -27,7 +27,8 @@ from mujoban_estimator.evaluate import evaluate
 from mujoban_estimator.losses import Views, estimator_loss, termination_loss
 from mujoban_estimator.odometry import Track
 from mujoban_estimator.termination import ControlTermination, TerminationConfig, true_phases
-from mujoban_rl.engine import Learner, State
+from mujoban_rl.best import JudgedLearner
+from mujoban_rl.engine import State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, step_if_finite, warm_up_linear
 from mujoban_rl.precision import autocast
@@ -38,6 +39,8 @@ _PLACE_OFF: Final = 0.02
 """Standard deviation of what needles of the place are off in use, in cells."""
 _HEADING_OFF: Final = math.radians(2.0)
 """The same of those of the heading."""
+JUDGED_BY: Final = ("boxes_all_right_if_seen", "termination_precision")
+"""Rates that tell which modules of a run are best, in this order: wrong estimates are what loses levels."""
 
 
 @dataclass(frozen=True)
@@ -140,8 +143,12 @@ class _Learned(NamedTuple):
     track: Track
 
 
-class EstimatorLearner(Learner[Batch]):
-    """Trains both modules, with what they remember of each stream; a batch continues the one before."""
+class EstimatorLearner(JudgedLearner[Batch]):
+    """Trains both modules, with what they remember of each stream; a batch continues the one before.
+
+    Those that are right on most frames of the validation bags are exported: bags of few episodes are soon known by
+    heart, which makes what has learned from many worse.
+    """
 
     def __init__(
         self, config: TrainConfig, *, device: str = "cpu", validation: Sequence[Path] = (), skip_damaged: bool = False,
@@ -156,6 +163,7 @@ class EstimatorLearner(Learner[Batch]):
             skip_damaged: Leave damaged parts of these out instead of refusing them.
             out: Folder that receives the weights of both modules; None: `weights` in the run's directory.
         """
+        super().__init__()
         self.training, self.config = config, config.learner
         self.device = usable_device(device)
         self.rng = np.random.default_rng(config.seed)
@@ -219,14 +227,14 @@ class EstimatorLearner(Learner[Batch]):
         parts = {name: [one.parts[name].item() for one in learned] for name in learned[0].parts}
         return {f"train/{name}": float(np.mean(values)) for name, values in [("loss", loss.item()), *parts.items()]}
 
-    def state(self) -> State:
+    def own_state(self) -> State:
         """Return the random state and what the modules remember of each stream."""
         tensors = {f"belief.{k}": v for k, v in self._belief._asdict().items()}
         tensors |= {f"track.{k}": v for k, v in self._track._asdict().items()}
         return State({"rng": self.rng.bit_generator.state, "begun": self._begun.tolist()}, tensors)
 
-    def restore(self, state: State) -> None:
-        """Take over what `state` returned."""
+    def restore_own(self, state: State) -> None:
+        """Take over what `own_state` returned."""
         self.rng.bit_generator.state = state.values["rng"]
         tensors = {k: v.to(self.device) for k, v in state.tensors.items()}
         self._belief = Belief(*(tensors[f"belief.{k}"] for k in Belief._fields))
@@ -235,16 +243,26 @@ class EstimatorLearner(Learner[Batch]):
         self._begun = np.array(state.values.get("begun", self._begun), np.bool_)
 
     def evaluate(self) -> dict[str, float]:
-        """Return the rates of both modules on the validation bags."""
+        """Return the rates of both modules on the validation bags; keep the two if these make them the best."""
         if not self._validation:
             return {}
-        return evaluate(self.estimator, self.termination, self._validation, skip_damaged=self._skip_damaged)
+        found = evaluate(self.estimator, self.termination, self._validation, skip_damaged=self._skip_damaged)
+        # A rate of nothing is not a number, which is no better than any.
+        rates = {name: rate for name, rate in found.items() if math.isfinite(rate)}
+        self.best.judge(self._both, tuple(rates.get(name, 0.0) for name in JUDGED_BY), rates)
+        return rates
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the weights of both modules."""
+        """Write the weights of the best two modules, or of the present ones where none were judged."""
         out = self._out or directory.path / "weights"
+        best, told = self.best.chosen(self._both), {**record, **self.best.told}
         for name, module in (("estimator", self.estimator), ("termination", self.termination)):
-            save_weights(out / f"{name}.safetensors", module, module.hyperparameters(), record)
+            save_weights(out / f"{name}.safetensors", best[name], module.hyperparameters(), told)
+
+    @property
+    def _both(self) -> nn.ModuleDict:
+        """Both modules as one, since they share a ResNet."""
+        return nn.ModuleDict(self.modules)
 
     def _lost_track(self, streams: int) -> Track:
         """Return tracks at the start of episodes whose odometers are off."""

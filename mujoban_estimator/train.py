@@ -117,7 +117,10 @@ def make_trainer(options: Options) -> Trainer[Batch]:
         learner,
         source,
         Budget(updates=config.steps, cpu_seconds=config.cpu_seconds, seconds=config.horizon_seconds),
-        Cadence(log_updates=50, evaluate_samples=every, save_seconds=options.save_every),
+        Cadence(
+            log_updates=50, evaluate_samples=every, save_seconds=options.save_every,
+            evaluate_first=options.start is not None,
+        ),
         record=record,
     )
     if not trainer.complete:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from estimator_bags import SEED, copy_without, made_up_ticks
 
 from bringup.command import Choice, Stack
@@ -190,6 +191,25 @@ def test_a_run_that_began_with_weights_goes_on_with_the_same_named_ones_alone(ma
     make_trainer(options)
     with pytest.raises(RunError, match=r"start: \{'estimator': '.*'\} there, None now"):
         make_trainer(replace(options, start=None))
+
+
+def test_modules_that_training_makes_worse_are_exported_as_they_were(make, bags, tmp_path, monkeypatch):
+    make(tmp_path / "made").save()
+    given = tmp_path / "made" / "weights"
+    rates = iter([0.9, float("nan"), 0.8])
+    monkeypatch.setattr(
+        "mujoban_estimator.learner.evaluate",
+        lambda *args, **kw: {"boxes_all_right_if_seen": next(rates), "termination_precision": float("nan")},
+    )
+    config = TrainConfig(LearnerConfig(*SMALL, window_frames=8), streams=1, length=4, steps=2)
+    options = Options((bags,), tmp_path / "run", (bags,), start=given, config=config, workers=0, evaluate_every=1)
+    make_trainer(options).run()
+    for name, module in (("estimator", load), ("termination", load_termination)):
+        file = tmp_path / "run" / "weights" / f"{name}.safetensors"
+        kept, first = module(file).state_dict(), module(given / file.name).state_dict()
+        assert all(torch.equal(kept[key], first[key]) for key in first)
+        record = json.loads(file.with_suffix(".json").read_text())
+        assert record["evaluation"] == 0 and record["validation"] == {"boxes_all_right_if_seen": 0.9}
 
 
 def test_modules_of_different_bodies_are_not_judged_together(bags):
