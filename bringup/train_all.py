@@ -1,11 +1,10 @@
 """Make the weights of all four modules from nothing: `python -m bringup.train_all --hours 8 --run runs/all`.
 
 Bottom-up, as in the paper (section 2, Training): the controller (a teacher by reward, its camera policy by
-distillation) beside the planner; bags of both with perfect sense; estimator and termination from these bags, beside MPO
-of the controller and the planner's lessons in partial views; bags of all four, and estimator and termination again from
-both. No weight that ships is read. Stop it at any time: the same command goes on. At the end stand `weights/` and
-`report.md` in the run's directory. With `--continue` another run takes up all modules where a finished one has left
-them.
+distillation, then by MPO) beside the planner; bags of both with perfect sense; estimator and termination from these
+bags; bags of all four, and estimator and termination again from both. No weight that ships is read. Stop it at any
+time: the same command goes on. At the end stand `weights/` and `report.md` in the run's directory. With `--continue`
+another run takes up all modules where a finished one has left them, and with `--keep` those that are not named.
 """
 
 from __future__ import annotations
@@ -19,11 +18,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import tyro
 from rich.console import Console
 
+from bringup import keep
 from bringup.options import Count, WorldOptions, whole
 from bringup.pipeline import Pipeline, Stage
 from bringup.training_display import Display
@@ -37,7 +37,7 @@ from mujoban_sokoban.generator import FRESH_SEEDS, TRAIN_SEEDS
 PROG = "bringup.train_all"
 WEIGHTS: Final = {
     "controller": "controller_mpo/controller.safetensors",
-    "planner": "planner_views/planner.safetensors",
+    "planner": "planner/planner.safetensors",
     "estimator": "estimator_second/weights/estimator.safetensors",
     "termination": "estimator_second/weights/termination.safetensors",
 }
@@ -47,30 +47,33 @@ PRODUCTS: Final = {
     "teacher": "teacher/teacher.safetensors",
     "critic": "teacher/critic.safetensors",
     "student": "controller_distil/controller.safetensors",
-    "whole": "planner/planner.safetensors",
     "first": "bags_first",
     "second": "bags_second",
 }
-"""And all that another stage needs: the teacher, its student, the planner of boards in full view, the bags."""
+"""And all that another stage needs: the teacher, its student, the bags."""
 _BAGS: Final = ("first", "second")
+_TRAININGS: Final = {
+    "controller": ("teacher", "controller_distil", "controller_mpo"),
+    "planner": ("planner",),
+    "senses": ("estimator_first", "estimator_second"),
+}
+"""The stages that train each module; the senses are two modules that learn together."""
 SHARES: Final = {
     "teacher": 0.09,
     "controller_distil": 0.31,
-    "planner": 0.40,
-    "bags_first": 0.05,
-    "bags_validation": 0.01,
-    "estimator_first": 0.21,
+    "planner": 0.50,
     "controller_mpo": 0.10,
-    "planner_views": 0.12,
+    "bags_first": 0.03,
+    "bags_validation": 0.01,
+    "estimator_first": 0.12,
     "bags_second": 0.03,
-    "estimator_second": 0.21,
+    "estimator_second": 0.22,
     "evaluation": 0.08,
     "evaluation_ahead": 0.08,
 }
-"""Share of the hours that each stage gets, in their order. Every training has a core: teacher and student beside the
-planner, then the second steps of controller and planner beside the first of the senses, whose second has all cores, for
-each a shard of the batch. More threads to a shard bring nothing, and cost six times as much where they must share a
-core."""
+"""Share of the hours that each stage gets, in their order. The controller's trainings have one core and the planner's
+the other; the senses then have all, for each a shard of the batch. More threads to a shard bring nothing, and cost six
+times as much where they must share a core."""
 _STEPS: Final = 10**12
 """More than any budget of time lets a trainer take."""
 _SAVED: Final = 0.92
@@ -83,7 +86,7 @@ _EVALUATED_STEPS: Final = 125_000
 """Environment steps of the controller's training between two evaluations, per hour of the whole run, from one hour on
 up to four. No budget counts them, and those of what has hardly learned yet take long."""
 _PLANNER_EVALUATIONS: Final = 5
-"""Of each training of the planner."""
+"""Of the training of the planner."""
 _SENSES_EVALUATIONS: Final = 500
 """Updates between two evaluations of the senses, per hour of the whole run."""
 _JUDGED_PER_HOUR: Final = 16
@@ -102,7 +105,7 @@ _TURNING_TEACHER: Final = (
 taught such a body (docs/research/controller.md); it leaves no critic for the student's MPO to begin with."""
 _SENSES: Final = ("--learner.slip", "0.015", "--learner.lost", "0.05")
 """How far the odometer is off in training of estimator and termination."""
-_VIEWS: Final = ("--noise", "0.1", "--hidden", "0.3")
+_VIEWS: Final = ("--noise", "0.05", "--hidden", "0.1")
 """Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
 _LEVELS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
@@ -110,8 +113,6 @@ _VALIDATION_BAGS: Final = 8_000_000
 """Seed of the first level of the bags on which the senses are judged."""
 _VALIDATION_PER_HOUR: Final = 6
 """Episodes of them, per hour of the whole run; at most 32."""
-_LAST_SEED: Final = (LAST_SEED - 1) // 2
-"""The largest of a run, of which the planner's two trainings have two seeds."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,8 @@ class Options:
     before: Annotated[Path | None, tyro.conf.arg(name="continue")] = None
     """Directory of a finished run: every module goes on from its weights, and learns also from its bags, if they are
     still there."""
+    keep: tuple[Literal["controller", "planner", "senses"], ...] = ()
+    """Modules that stay what they are there; bags are recorded for the senses alone."""
     physics: Annotated[WorldOptions, tyro.conf.arg(name="")] = field(default_factory=WorldOptions)
     seed: Annotated[int, whole("N", 0)] = 0
     cores: Count = 2
@@ -137,8 +140,10 @@ class Options:
         """Reject times in which nothing can be learned, and seeds past those for training."""
         if not 0 < self.hours < math.inf:
             raise ValueError(f"--hours {self.hours}: expected a positive number")
-        if not 0 <= self.seed <= _LAST_SEED:
-            raise ValueError(f"--seed {self.seed}: expected a whole number from 0 to {_LAST_SEED}")
+        if not 0 <= self.seed <= LAST_SEED:
+            raise ValueError(f"--seed {self.seed}: expected a whole number from 0 to {LAST_SEED}")
+        if self.keep and self.before is None:
+            raise ValueError(f"--keep {' '.join(self.keep)}: expected --continue, which says whose are kept")
         spared = _BAGS if self.has_critic else (*_BAGS, "critic")
         needed = (path for name, path in PRODUCTS.items() if name not in spared)
         missing = [] if self.before is None else [path for path in needed if not (self.before / path).exists()]
@@ -162,8 +167,10 @@ def stages(options: Options) -> list[Stage]:
     Raises:
         WeightsError: If the planner that is gone on from has no record.
     """
-    evaluations = (_evaluation(options, name) for name in EVALUATIONS)
-    found = [*_controller(options), *_planner(options), *_senses(options), *evaluations]
+    makers = {"controller": _controller, "planner": _planner, "senses": _senses}
+    found = [_evaluation(options, name) for name in EVALUATIONS]
+    for module, make in makers.items():
+        found += _kept(options, module) if module in options.keep else make(options)
     order = list(SHARES)
     return sorted(found, key=lambda stage: order.index(stage.name))
 
@@ -211,6 +218,24 @@ def _trainer(
     )  # fmt: skip
 
 
+def _kept(options: Options, module: str) -> list[Stage]:
+    """Return stages that take over what the run that is gone on from has made of a module."""
+    assert options.before is not None
+    made = [*PRODUCTS.values(), WEIGHTS["estimator"].replace("second", "first")]
+    found = list[Stage]()
+    for name in _TRAININGS[module]:
+        folder = options.before / name
+        products = [path for path in made if path.startswith(f"{name}/") and (options.before / path).exists()]
+        command = ("-m", keep.PROG, "--made", str(folder), "--out", str(options.run / name))
+        found.append(
+            Stage(
+                name, command, tuple(options.run / path for path in products), seconds=1.0, resumes=False,
+                sources=tuple(options.before / path for path in products),
+            )
+        )  # fmt: skip
+    return found
+
+
 def _controller(options: Options) -> list[Stage]:
     run, teacher, student = options.run, PRODUCTS["teacher"], PRODUCTS["student"]
     common = ("--seed", str(options.seed), "--task.world", options.physics.world)
@@ -244,24 +269,17 @@ def _controller(options: Options) -> list[Stage]:
 
 
 def _planner(options: Options) -> list[Stage]:
-    """Return the stages of the planner: boards in full view, then also boards as an estimator sees them."""
-    method = ("mujoban_planner.train", "expert-iteration")
-    every = (max(1, round(_seconds(options, n) / _PLANNER_EVALUATIONS)) for n in ("planner", "planner_views"))
-    # Each has levels of its own.
-    first, second = (
-        ("--seed", str(2 * options.seed + i), "--evaluate-every", str(seconds)) for i, seconds in enumerate(every)
-    )
-    whole = PRODUCTS["whole"]
-    network = () if options.before is None else options.machine.begun_with(options.before / whole)
-    views = ("--init", str(options.run / whole), "--learning-rate", "7e-4", *_VIEWS)
+    """Return the training of the planner, on boards in full view and as an estimator sees them."""
+    product = WEIGHTS["planner"]
+    network = () if options.before is None else options.machine.begun_with(options.before / product)
+    every = max(1, round(_seconds(options, "planner") / _PLANNER_EVALUATIONS))
+    command = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.seed), "--evaluate-every", str(every))
+    begun = _from_before(options, "--init", "planner")
     return [
         _trainer(
-            options, "planner", (*method, *first, *_from_before(options, "--init", "whole")), whole,
-            sources=_sources(options, "whole"), last=network,
-        ),
-        _trainer(
-            options, "planner_views", (*method, *second, *views), WEIGHTS["planner"], "planner", last=network,
-        ),
+            options, "planner", (*command, *begun, *_VIEWS), product, sources=_sources(options, "planner"),
+            last=network,
+        )
     ]  # fmt: skip
 
 
@@ -324,12 +342,9 @@ def _recording(options: Options, name: str) -> Stage:
     """Return a stage that records bags: the first of what has learned until then, with perfect sense, then of all."""
     run, first = options.run, name == "bags_first"
     cores = options.machine.cores_of(name)
-    if first:
-        needs = {"controller": "controller_distil", "planner": "planner"}
-        acting = {"controller": PRODUCTS["student"], "planner": PRODUCTS["whole"]}
-    else:
-        needs = {"controller": "controller_mpo", "planner": "planner_views", "senses": "estimator_first"}
-        acting = {role: WEIGHTS[role].replace("estimator_second", "estimator_first") for role in WEIGHTS}
+    needs = ("controller_mpo", "planner") if first else ("controller_mpo", "planner", "estimator_first")
+    roles = ("controller", "planner") if first else WEIGHTS
+    acting = {role: WEIGHTS[role].replace("estimator_second", "estimator_first") for role in roles}
     sense = ("--oracle", "estimator,termination") if first else ()
     modules = tuple(x for role, path in acting.items() for x in (f"--{role}", str(run / path)))
     episodes = max(8, round(_EPISODES_PER_HOUR * options.hours * options.machine.episodes))
@@ -342,7 +357,7 @@ def _recording(options: Options, name: str) -> Stage:
         "--processes", str(cores), *_physics(options), "--look-ahead", "0", *sense, *modules,
     )  # fmt: skip
     seconds = _seconds(options, name)
-    return Stage(name, command, (run / name,), tuple(needs.values()), seconds, cores, resumes=False)
+    return Stage(name, command, (run / name,), needs, seconds, cores, resumes=False)
 
 
 def _evaluation(options: Options, name: str) -> Stage:
@@ -355,7 +370,7 @@ def _evaluation(options: Options, name: str) -> Stage:
         "--seed", str(FRESH_SEEDS.start), *_physics(options), "--json", str(report),
         *weights, *EVALUATIONS[name].options,
     )  # fmt: skip
-    needs = ("estimator_second", "planner_views", "controller_mpo")
+    needs = ("estimator_second", "planner", "controller_mpo")
     return Stage(name, command, (report,), needs, _seconds(options, name))
 
 

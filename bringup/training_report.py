@@ -14,6 +14,7 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
+from bringup import keep
 from bringup.model_card import Place, Score, card
 from bringup.pipeline import Pipeline
 from mujoban_core.files import write_atomically
@@ -26,6 +27,8 @@ _RATES: Final = (
     "success_rate", "agent_accuracy", "boxes_all_right_if_seen", "termination_precision", "termination_recall",
 )  # fmt: skip
 """Scores that are drawn, of all that start so; the table has steps as well."""
+_ACTING: Final = ("teacher", "controller_")
+"""How the stages are named whose samples are steps in the environment."""
 _COLUMNS: Final = 4
 """Panels side by side in the figure of curves."""
 _RECORDED: Final = re.compile(r"^(\d+) ticks of ", re.MULTILINE)
@@ -126,7 +129,9 @@ def _steps(run: Path) -> int:
     """Return the environment steps of the controller's trainings and of what was recorded."""
     logs = (run / "logs").glob("bags_*.txt")
     recorded = sum(int(ticks) for log in logs for ticks in _RECORDED.findall(log.read_text()))
-    metrics = (run / stage / "metrics.jsonl" for stage in ("teacher", "controller_distil", "controller_mpo"))
+    # What was kept of another run was taken there.
+    trained = (name for name, entry in Pipeline.read(run).entries.items() if entry.command[1:2] != [keep.PROG])
+    metrics = (run / name / "metrics.jsonl" for name in trained if name.startswith(_ACTING))
     return recorded + sum(json.loads(file.read_text().splitlines()[-1])["step"] for file in metrics if file.exists())
 
 

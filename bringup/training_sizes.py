@@ -25,14 +25,13 @@ _SEARCHING: Final = (
 _ON_GPU: Final[Mapping[str, tuple[str, ...]]] = {
     "controller_distil": ("--task.batch", "192", "--distil.windows", "64", "--distil.first", "8000"),
     "planner": (*_SEARCHING, "--learning-rate", "2e-3"),
-    "planner_views": _SEARCHING,
     "estimator_first": ("--streams", "48", "--learner.window-frames", "512", "--learning-rate", "2.5e-3"),
     "estimator_second": ("--streams", "48", "--learner.window-frames", "512", "--learning-rate", "2e-3"),
 }
 """What trainings are told on a GPU, as its first weights learned (docs/research/weights.md)."""
-_HALF: Final = ("planner", "planner_views", "bags_first")
+_HALF: Final = ("planner",)
 """Stages that keep half of the cores beside a GPU busy; the others that run side by side have a quarter."""
-_ALL: Final = ("bags_second", "estimator_second")
+_ALL: Final = ("bags_first", "estimator_first", "bags_second", "estimator_second")
 """Those that have a machine to themselves."""
 _STREAMS_ALONE: Final = 5
 """Rows of the senses' batch on one core."""

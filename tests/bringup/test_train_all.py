@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import bringup.evaluate
+import bringup.keep
 import bringup.record
 import mujoban_controller.train
 import mujoban_estimator.train
@@ -38,7 +39,7 @@ def finished(folder: Path, planner: NetworkConfig | None = None, **training: Any
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     network = (planner or ExpertIterationConfig().network).build()
-    save_weights(folder / PRODUCTS["whole"], network, network.config, {"training": training})
+    save_weights(folder / PRODUCTS["planner"], network, network.config, {"training": training})
     return folder
 
 
@@ -67,7 +68,7 @@ def test_a_continued_run_takes_every_module_from_the_one_before(tmp_path: Path) 
     found = commands(Options(run=tmp_path / "run", before=before))
     for name, option, product in (
         ("teacher", "--initial", "teacher"), ("teacher", "--critic", "critic"),
-        ("controller_distil", "--initial", "controller"), ("planner", "--init", "whole"),
+        ("controller_distil", "--initial", "controller"), ("planner", "--init", "planner"),
     ):  # fmt: skip
         assert found[name][found[name].index(option) + 1] == str(before / PRODUCTS[product])
     first = found["estimator_first"]
@@ -91,27 +92,47 @@ def test_a_planner_goes_on_in_a_network_that_holds_the_one_before(
 ) -> None:
     former = finished(tmp_path / "before", before, thoughts=[1, 4])
     found = commands(Options(run=tmp_path / "run", before=former, device=device, cores=4))
-    for stage in ("planner", "planner_views"):
-        options = read_options({"expert-iteration": mujoban_planner.train.ExpertIteration}, found[stage][2:], stage)
-        network = options.config.build()
-        assert network.config == expected.build().config
-        start_from(network, former / PRODUCTS["whole"])
-        taught = {"cuda": (1, 2, 1, 4), "cpu": (1, 4) if before.architecture == "thinking" else (1,)}
-        assert options.config.thoughts == taught[device]
+    programs = {"expert-iteration": mujoban_planner.train.ExpertIteration}
+    options = read_options(programs, found["planner"][2:], "planner")
+    network = options.config.build()
+    assert network.config == expected.build().config
+    start_from(network, former / PRODUCTS["planner"])
+    taught = {"cuda": (1, 2, 1, 4), "cpu": (1, 4) if before.architecture == "thinking" else (1,)}
+    assert options.config.thoughts == taught[device]
 
 
 def test_a_planner_of_the_same_size_needs_no_options(tmp_path: Path) -> None:
     """So the commands of runs that were begun before stay what they were."""
     begun = commands(Options(run=tmp_path / "run", before=finished(tmp_path / "before")))
-    assert not {"--architecture", "--channels", "--blocks", "--thoughts"} & {*begun["planner"], *begun["planner_views"]}
+    assert not {"--architecture", "--channels", "--blocks", "--thoughts"} & {*begun["planner"]}
 
 
 def test_a_planner_without_a_record_is_refused_before_anything_begins(tmp_path: Path) -> None:
     before, run = finished(tmp_path / "before"), tmp_path / "run"
-    (before / PRODUCTS["whole"]).with_suffix(".json").unlink()
+    (before / PRODUCTS["planner"]).with_suffix(".json").unlink()
     with pytest.raises(ValueError, match=r"planner\.json: no record beside the weights; expected a JSON file"):
         train_all(Options(run=run, before=before))
     assert not run.exists()
+
+
+def test_modules_that_are_kept_are_those_of_the_run_before_and_the_others_go_on(tmp_path: Path) -> None:
+    before, run = finished(tmp_path / "before"), tmp_path / "run"
+    (before / "estimator_first").mkdir()
+    (before / "controller_mpo" / "checkpoint-1.json").touch()
+    found = {stage.name: stage for stage in stages(Options(run=run, before=before, keep=("controller", "senses")))}
+    trained = {name for name, stage in found.items() if stage.command[1] != bringup.keep.PROG}
+    assert trained == {"planner", *EVALUATIONS}, "and nothing is recorded, since the senses learn nothing"
+    for name in found.keys() - trained:
+        bringup.keep.main(found[name].command[2:])
+        assert all(product.exists() for product in found[name].products)
+    kept = {Path(path).parts[0] for role, path in WEIGHTS.items() if role != "planner"}
+    assert all(kept & set(found[name].needs) == kept for name in EVALUATIONS)
+    assert not [*run.rglob("checkpoint-*")] and not (run / "planner").exists()
+
+
+def test_what_is_kept_must_be_of_a_run() -> None:
+    with pytest.raises(ValueError, match="--keep planner: expected --continue"):
+        Options(keep=("planner",))
 
 
 def test_a_run_whose_bags_are_gone_is_continued_with_new_ones_alone(tmp_path: Path) -> None:
@@ -179,7 +200,7 @@ def test_bad_options_are_refused_before_anything_runs(option: str, value: str, e
 
 
 def test_the_largest_seed_has_levels_for_every_training(tmp_path: Path) -> None:
-    seed = (LAST_SEED - 1) // 2
+    seed = LAST_SEED
     for name, command in commands(Options(run=tmp_path, seed=seed)).items():
         if name.startswith("planner"):
             stream = stream_number(int(command[command.index("--seed") + 1]), 999)
@@ -239,15 +260,15 @@ def test_a_gpu_is_given_its_time_by_the_clock_and_work_for_all_cores_beside_it(t
     run = Options(run=tmp_path, hours=0.5, device="cuda", cores=16)
     found = {stage.name: stage for stage in stages(run)}
     trainings = [stage for stage in found.values() if "--run" in stage.command]
-    assert len(trainings) == 7
+    assert len(trainings) == 6
     for stage in trainings:
         command = stage.command
         assert command[command.index("--device") + 1] == "cuda"
         assert 0.9 * stage.seconds < float(command[command.index("--horizon-seconds") + 1]) < stage.seconds
         assert float(command[command.index("--cpu-seconds") + 1]) > 100 * run.hours * 3600
-    for side_by_side in (("controller_distil", "planner"), ("controller_mpo", "planner_views", "estimator_first")):
-        assert 12 <= sum(found[name].cores for name in side_by_side) <= run.cores
-    assert found["estimator_second"].cores == run.cores
+    for controller in ("teacher", "controller_distil", "controller_mpo"):
+        assert found[controller].cores + found["planner"].cores == 12
+    assert all(found[f"estimator_{round_}"].cores == run.cores for round_ in ("first", "second"))
 
 
 def test_the_report_stands_beside_weights_with_their_cards(tmp_path: Path) -> None:
