@@ -216,14 +216,15 @@ Player = Stack | Solo
 """What commands play with."""
 
 
-def recorded_seed(seed: int | None, *, allow_test_seeds: bool) -> int:
-    """Return the seed of the first episode of a recording: of those for training where nobody says otherwise.
+def recorded_seeds(seed: int | None, *, allow_test_seeds: bool, noted: bool = False) -> range:
+    """Return the seeds with which a recording begins: those for training where nobody says otherwise.
 
     That test levels are recorded is said on stderr.
 
     Args:
         seed: As given on the command line; None where it was not.
         allow_test_seeds: Whether episodes may be recorded though they are not for training.
+        noted: Whether a report notes the use of test levels, or levels are none of the generator's.
 
     Raises:
         ValueError: If they are not for training and that is not allowed.
@@ -231,15 +232,15 @@ def recorded_seed(seed: int | None, *, allow_test_seeds: bool) -> int:
     from mujoban_sokoban.generator import TEST_SEEDS, TRAIN_SEEDS
 
     if seed is None:
-        return TRAIN_SEEDS.start
+        return TRAIN_SEEDS
     if seed not in TRAIN_SEEDS and not allow_test_seeds:
         raise ValueError(
             f"--seed {seed}: its levels are not for training; expected one from {TRAIN_SEEDS.start} on for a "
             "recording, or --allow-test-seeds"
         )
-    if seed in TEST_SEEDS:
+    if seed in TEST_SEEDS and not noted:
         say(f"test levels are recorded, from seed {seed} on, and this is written nowhere but in the bags")
-    return seed
+    return range(seed, TRAIN_SEEDS.stop)
 
 
 def oracle(role: str, body: str) -> Choice:

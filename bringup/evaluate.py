@@ -101,7 +101,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     from mujoban_sokoban.generator import VALIDATION_SEEDS
 
     play = options.play
-    episodes = play.make(VALIDATION_SEEDS.start if play.seed is None else play.seed)
+    episodes = play.make(play.seed, VALIDATION_SEEDS)
     stack = options.modules.player(play.body)
     set_threads(stack.threads)
     reporting = Reporting(options.json, stack.identities(), episodes, played(stack, episodes, play))

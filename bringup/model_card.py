@@ -245,7 +245,9 @@ def _training(record: Mapping[str, Any]) -> list[tuple[str, str]]:
             of = whole if name in _SPENT else ""
             rows.append((name + of, f"{value:,}" if isinstance(value, int) else f"`{value}`"))
     if whole and record.get("evaluation") is not None:
-        rows.append(("kept", f"what the run had at its evaluation {record['evaluation']}, counted from 0"))
+        begun = record.get("initial") or record.get("start") or record.get("training", {}).get("init")
+        nothing = ": what it began with, as training made it no better" if begun and record["evaluation"] == 0 else ""
+        rows.append(("kept", f"what the run had at its evaluation {record['evaluation']}, counted from 0{nothing}"))
     return rows
 
 

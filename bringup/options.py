@@ -195,12 +195,12 @@ class EpisodeOptions(WorldOptions):
     levels: FilePath = None
     """Play the levels of a Boxoban text file instead of generated ones."""
 
-    def make(self, seed: int | None) -> Episodes:
+    def make(self, seed: int | None, seeds: range | None = None) -> Episodes:
         """Return the episodes from a seed on (None: see `Episodes`); say on stderr which of a file are unsolvable."""
         from mujoban_sokoban.episodes import Episodes
         from mujoban_sokoban.solver import Status, solve_levels
 
-        episodes = Episodes(self.episodes, seed, difficulty=self.difficulty, level_file=self.levels)
+        episodes = Episodes(self.episodes, seed, difficulty=self.difficulty, level_file=self.levels, seeds=seeds)
         levels = episodes.source.levels
         for index in sorted({seed % len(levels) for seed in episodes.seeds}) if levels else ():
             # One by one: Ctrl-C is heard between two.

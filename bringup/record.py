@@ -26,7 +26,7 @@ import numpy as np
 from tyro.conf import arg
 
 from bringup.cluster import needs, spread
-from bringup.command import Stack, import_from_here, recorded_seed
+from bringup.command import Stack, import_from_here, recorded_seeds
 from bringup.exploration import Disturbance, disturbed
 from bringup.options import ClusterOptions, Count, ModuleOptions, WorldOptions, one_of, whole
 from bringup.progress import EpisodesBar
@@ -290,8 +290,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
     options = read_options(Options, command_line, called(PROG), __doc__)
     import_from_here()
     check_folder("--out", options.out, may_exist=True)
-    seed = recorded_seed(options.seed, allow_test_seeds=options.allow_test_seeds)
-    jobs = [_job(options, seed, part) for part in range(options.parts)]
+    seeds = recorded_seeds(options.seed, allow_test_seeds=options.allow_test_seeds)
+    jobs = [_job(options, seeds.start, part) for part in range(options.parts)]
     options.out.mkdir(parents=True, exist_ok=True)
     recorded = 0
     with EpisodesBar(options.episodes) as bar:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from tyro.conf import arg
 
-from bringup.command import import_from_here, recorded_seed
+from bringup.command import import_from_here, recorded_seeds
 from bringup.options import INTERFACE, SPEED, Count, EpisodeOptions, FilePath, FolderPath, PlayerOptions
 from mujoban_core.files import check_file, check_folder
 from mujoban_core.program import called, read_options, run_command
@@ -59,13 +59,14 @@ def main(command_line: Sequence[str] | None = None) -> int:
     options = read_options(Options, command_line, called(PROG))
     play, stack = options.play, options.modules.player(options.play.body)
     import_from_here()
-    seed = play.seed
+    seeds = None
     if options.record is not None:
-        seed = recorded_seed(seed, allow_test_seeds=options.allow_test_seeds)
+        noted = options.json is not None or play.levels is not None
+        seeds = recorded_seeds(play.seed, allow_test_seeds=options.allow_test_seeds, noted=noted)
     check_folder("--record", options.record)
     check_file("--video", options.video)
     check_file("--json", options.json)
-    episodes = play.make(seed)
+    episodes = play.make(play.seed, seeds)
 
     from rich.console import Console
 

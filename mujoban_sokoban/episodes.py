@@ -123,14 +123,16 @@ class Episodes(LazyEpisodes):
         *,
         difficulty: int = max(DIFFICULTIES),
         level_file: Path | None = None,
+        seeds: range | None = None,
     ) -> None:
         """Describe the run.
 
         Args:
             count: Number of episodes; None means one, or as many as a level file has levels.
-            seed: Seed of episode 0, not negative; None: the first of `PLAY_SEEDS`, or of a file the first level.
+            seed: Seed of episode 0, not negative; None: the first of `seeds`, or that plays a file's first level.
             difficulty: 1 to 5, for generated levels.
             level_file: Levels in the Boxoban format.
+            seeds: Those to begin with where no seed is given; None: `PLAY_SEEDS`, or of a file all from 0 on.
 
         Raises:
             ValueError: If an argument is out of its range.
@@ -139,7 +141,9 @@ class Episodes(LazyEpisodes):
         """
         self.source = LevelSource.make(difficulty, level_file)
         if seed is None:
-            seed = 0 if self.source.levels else PLAY_SEEDS.start
+            levels = len(self.source.levels)
+            first = (0 if levels else PLAY_SEEDS.start) if seeds is None else seeds.start
+            seed = first + (-first % levels if levels else 0)
         check_seed(seed)
         if count is not None and count < 1:
             raise ValueError(f"{count} episodes: expected at least 1")

@@ -54,6 +54,9 @@ def test_a_record_that_notes_which_evaluation_was_kept_has_it_on_its_card(tmp_pa
     noted.write_text(json.dumps(record))
     told = model_card.card(noted, "teacher.safetensors", model_card.Place("x", None, "levels"))
     assert "| kept | what the run had at its evaluation 2, counted from 0 |" in told
+    noted.write_text(json.dumps(record | {"evaluation": 0, "initial": "0" * 64}))
+    told = model_card.card(noted, "teacher.safetensors", model_card.Place("x", None, "levels"))
+    assert "at its evaluation 0, counted from 0: what it began with, as training made it no better |" in told
 
 
 def test_the_readme_tells_of_each_module_how_it_learned_and_which_rules_stand_beside_it():

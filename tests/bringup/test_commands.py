@@ -16,7 +16,7 @@ import pytest
 from commands import ALL_ORACLES, BUT_PLANNER, UNSOLVABLE, run
 
 from bringup import evaluate, record, run_stack, train
-from bringup.command import recorded_seed
+from bringup.command import recorded_seeds
 from mujoban_controller import teacher_weights
 from mujoban_core.files import digest
 from mujoban_core.plugins import shipped_weights
@@ -282,12 +282,13 @@ def test_another_body_plays_with_modules_that_fit_it(tmp_path, ant_teacher, capf
 
 
 def test_levels_that_are_not_for_training_are_recorded_only_when_that_is_asked_for(capsys):
-    assert recorded_seed(None, allow_test_seeds=False) in TRAIN_SEEDS
-    assert recorded_seed(5_000_000, allow_test_seeds=True) == 5_000_000
+    assert recorded_seeds(None, allow_test_seeds=False) == TRAIN_SEEDS
+    assert recorded_seeds(5_000_000, allow_test_seeds=True).start == 5_000_000
+    assert recorded_seeds(7, allow_test_seeds=True, noted=True).start == 7
     assert not capsys.readouterr().err
-    assert recorded_seed(7, allow_test_seeds=True) == 7
+    assert recorded_seeds(7, allow_test_seeds=True).start == 7
     assert capsys.readouterr().err.startswith("test levels are recorded, from seed 7 on")
-    assert recorded_seed(10_000_000, allow_test_seeds=False) == 10_000_000
+    assert recorded_seeds(10_000_000, allow_test_seeds=False).start == 10_000_000
     for seed in (7, 5_000_000, 9_999_999):
         with pytest.raises(ValueError, match=r"expected one from 10000000 on .* or --allow-test-seeds"):
-            recorded_seed(seed, allow_test_seeds=False)
+            recorded_seeds(seed, allow_test_seeds=False)

@@ -26,6 +26,8 @@ def test_without_a_seed_levels_are_none_of_those_for_tests_and_a_file_is_played_
     write_levels(tmp_path / "levels.txt", levels)
     filed = Episodes(None, None, level_file=tmp_path / "levels.txt")
     assert [episode.level.to_text() for episode in filed] == [level.to_text() for level in levels]
+    first = Episodes(1, None, level_file=tmp_path / "levels.txt", seeds=VALIDATION_SEEDS)
+    assert first.seed in VALIDATION_SEEDS and first[0].level.to_text() == levels[0].to_text()
 
 
 def test_a_copy_for_another_process_has_the_same_episodes():
