@@ -16,7 +16,7 @@ from matplotlib import pyplot as plt
 
 from bringup import keep
 from bringup.model_card import Place, Score, card
-from bringup.pipeline import Pipeline
+from bringup.pipeline import Entry, Pipeline
 from mujoban_core.files import write_atomically
 from mujoban_core.text import readable
 from mujoban_rl.metrics import read_metrics
@@ -130,9 +130,14 @@ def _steps(run: Path) -> int:
     logs = (run / "logs").glob("bags_*.txt")
     recorded = sum(int(ticks) for log in logs for ticks in _RECORDED.findall(log.read_text()))
     # What was kept of another run was taken there.
-    trained = (name for name, entry in Pipeline.read(run).entries.items() if entry.command[1:2] != [keep.PROG])
+    trained = (name for name, entry in Pipeline.read(run).entries.items() if not _is_kept(entry))
     metrics = (run / name / "metrics.jsonl" for name in trained if name.startswith(_ACTING))
     return recorded + sum(json.loads(file.read_text().splitlines()[-1])["step"] for file in metrics if file.exists())
+
+
+def _is_kept(entry: Entry) -> bool:
+    """Return whether a stage took over what another run had made."""
+    return entry.command[1:2] == [keep.PROG]
 
 
 def _score(name: str, report: Mapping[str, Any]) -> Score:
@@ -177,7 +182,8 @@ def _stages(run: Path, pipeline: Pipeline) -> Iterator[str]:
         done = (readable(record[kind]) if kind in record else "" for kind in ("samples", "updates"))
         entry = pipeline.entries[stage.name]
         minutes = (readable(seconds / 60) for seconds in (entry.seconds, entry.cpu_seconds))
-        cells = (stage.name, *minutes, *done, scores)
+        name = f"{stage.name} (kept: what it once took is not counted)" if _is_kept(entry) else stage.name
+        cells = (name, *minutes, *done, scores)
         yield f"| {' | '.join(cells)} |"
 
 

@@ -282,9 +282,14 @@ def test_the_report_stands_beside_weights_with_their_cards(tmp_path: Path) -> No
     outcome = {"success_rate": 0.5, "success_interval": [0.1, 0.9], "mean_return": 7.0}
     outcome |= {"failures": {}, "episodes": [1, 2]}
     (tmp_path / "evaluation.json").write_text(json.dumps(outcome))
+    ran = {"teacher": ["-m", bringup.keep.PROG], "controller_mpo": ["-m", "mujoban_controller.train"]}
+    (tmp_path / "pipeline.json").write_text(json.dumps({name: {"command": words} for name, words in ran.items()}))
+    for name, steps in (("teacher", 500), ("controller_mpo", 7)):
+        (tmp_path / name / "metrics.jsonl").write_text(json.dumps({"step": steps}) + "\n")
     options = Options(run=tmp_path)
     text = write_report(tmp_path, Pipeline(tmp_path, stages(options)), WEIGHTS).read_text()
     assert "levels of difficulty 5, seeds from 7000000, by which no stage chooses" in text
+    assert "| planner |" in text and "| teacher (kept" in text and "and 7 environment steps" in text
     title = "all four modules, the planner's policy alone"
     assert f"| {title} | 2 | **50.0%** | 10.0% to 90.0% | 7.00 | none |" in text and "search ahead" not in text
     assert "success_rate/5 0.75" in text
