@@ -18,7 +18,7 @@ from tyro.conf import arg
 from benchmarks.command import run_benchmark
 from bringup.command import Choice, Stack
 from bringup.options import WorldOptions
-from bringup.rollout import rollout
+from bringup.rollout import ticks
 from bringup.stack import PlayOptions, play
 from mujoban_core.plugins import ROLES
 from mujoban_core.sense_plan_act import SensePlanAct
@@ -32,9 +32,9 @@ from mujoban_sokoban.generator import VALIDATION_SEEDS
 class Options:
     """What is measured."""
 
-    ticks: int = 75
+    ticks: int = 300
     """Of each contestant in a round."""
-    rounds: int = 32
+    rounds: int = 8
     difficulty: int = 5
     seed: int = VALIDATION_SEEDS.start
     oracle: tuple[str, ...] = ()
@@ -56,13 +56,15 @@ class Options:
 
 
 def _in_process(policy: SensePlanAct, episodes: Episodes, options: Options) -> float:
-    physics, ticks = options.physics, options.ticks
-    world = World(1, body=physics.body, world=physics.world, max_boxes=episodes.max_boxes, time_limit=ticks)
-    start = time.perf_counter()
-    steps = sum(result.steps for result in rollout(policy, world, episodes))
-    seconds = time.perf_counter() - start
+    """Return ticks per second from the first tick on, without ROS."""
+    physics = options.physics
+    world = World(
+        1, body=physics.body, world=physics.world, max_boxes=episodes.max_boxes, time_limit=options.ticks
+    )
+    # As the monitor of a graph counts: compiling the level is no tick.
+    ends = [time.perf_counter() for _ in ticks(policy, world, episodes)]
     world.close()
-    return steps / seconds
+    return (len(ends) - 1) / (ends[-1] - ends[0])
 
 
 def run(options: Options | None = None) -> dict[str, float]:
