@@ -48,9 +48,12 @@ def main() -> int:
     _learn_from(LessonActor(LessonConfig(levels=4), _NETWORK, 0).act(), "demonstrations")
     SearchActor(_NETWORK, SearchConfig(trees=8, expansions=8, steps=40), 0, 0).act()
     evaluate(Stack().policy(), Episodes(2, VALIDATION_SEEDS.start), time_limit=80)
-    # Who sees all searches ahead at once; whether learned senses do within a few ticks is up to them.
+    # Who sees all searches ahead at once, and finds ways to the end of easy levels; whether learned senses do within a
+    # few ticks is up to them.
     told = {role: oracle(role, BALL.name) for role in ("estimator", "termination")}
-    evaluate(Stack(Stack().choices | told).policy(), Episodes(1, VALIDATION_SEEDS.start), time_limit=80)
+    for count, difficulty in ((8, 1), (1, 5)):
+        episodes = Episodes(count, VALIDATION_SEEDS.start, difficulty=difficulty)
+        evaluate(Stack(Stack().choices | told).policy(), episodes, time_limit=80)
     with tempfile.TemporaryDirectory() as folder:
         _record(Path(folder))
     return 0

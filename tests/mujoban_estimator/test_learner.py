@@ -48,7 +48,7 @@ def test_shards_learn_what_the_whole_batch_teaches(monkeypatch):
         assert torch.linalg.norm(divided.grad - whole.grad) <= 1e-3 * torch.linalg.norm(whole.grad), name
         # Else Adam's one kernel steps along other weights' gradients.
         assert all(p.grad.stride() == p.stride() for p in (whole, divided)), name
-    whole, divided = (learner.state().tensors["belief.hidden"] for learner in learners)
+    whole, divided = (learner.own_state().tensors["belief.hidden"] for learner in learners)
     assert divided.shape[0] == 2
     for row in divided:
         np.testing.assert_allclose(row, whole[0], atol=1e-5)
@@ -65,7 +65,7 @@ def test_an_episode_that_begins_in_a_refused_batch_does_not_go_on_with_the_memor
     assert all(torch.equal(*both) for both in zip(shard.belief, learner.estimator.initial_belief(1), strict=True))
     learner.update(goes_on, 0.5, NaNGuard())
     (shard,) = learner._shards(goes_on)
-    assert torch.equal(shard.belief[0], learner.state().tensors["belief.hidden"])
+    assert torch.equal(shard.belief[0], learner.own_state().tensors["belief.hidden"])
 
 
 def test_estimator_and_termination_must_share_the_resnet():

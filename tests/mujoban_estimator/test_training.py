@@ -155,7 +155,7 @@ def test_damaged_parts_of_validation_bags_are_left_out_too_where_that_is_asked_f
     shutil.copytree(find_bags([bags])[0], damaged)
     (file,) = damaged.glob("*.mcap")
     content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 0xFF
+    content[2_000] ^= 0xFF  # in the first of two chunks, some 3,700 bytes from the start
     file.write_bytes(content)
     config = TrainConfig(LearnerConfig(*SMALL, window_frames=8), streams=1, length=4, steps=1)
     options = Options((bags,), tmp_path / "run", (damaged,), config=config, workers=0)
