@@ -51,9 +51,9 @@ def main() -> int:
     # Who sees all searches ahead at once, and finds ways to the end of easy levels; whether learned senses do within a
     # few ticks is up to them.
     told = {role: oracle(role, BALL.name) for role in ("estimator", "termination")}
+    seeing = Stack(Stack().choices | told).policy()
     for count, difficulty in ((8, 1), (1, 5)):
-        episodes = Episodes(count, VALIDATION_SEEDS.start, difficulty=difficulty)
-        evaluate(Stack(Stack().choices | told).policy(), episodes, time_limit=80)
+        evaluate(seeing, Episodes(count, VALIDATION_SEEDS.start, difficulty=difficulty), time_limit=80)
     with tempfile.TemporaryDirectory() as folder:
         _record(Path(folder))
     return 0

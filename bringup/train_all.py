@@ -52,12 +52,7 @@ PRODUCTS: Final = {
 }
 """And all that another stage needs: the teacher, its student, the bags."""
 _BAGS: Final = ("first", "second")
-_TRAININGS: Final = {
-    "controller": ("teacher", "controller_distil", "controller_mpo"),
-    "planner": ("planner",),
-    "senses": ("estimator_first", "estimator_second"),
-}
-"""The stages that train each module; the senses are two modules that learn together."""
+_RECORDER: Final = "bringup.record"
 SHARES: Final = {
     "teacher": 0.09,
     "controller_distil": 0.31,
@@ -170,7 +165,8 @@ def stages(options: Options) -> list[Stage]:
     makers = {"controller": _controller, "planner": _planner, "senses": _senses}
     found = [_evaluation(options, name) for name in EVALUATIONS]
     for module, make in makers.items():
-        found += _kept(options, module) if module in options.keep else make(options)
+        trained = make(options)
+        found += _kept(options, trained) if module in options.keep else trained
     order = list(SHARES)
     return sorted(found, key=lambda stage: order.index(stage.name))
 
@@ -218,21 +214,17 @@ def _trainer(
     )  # fmt: skip
 
 
-def _kept(options: Options, module: str) -> list[Stage]:
-    """Return stages that take over what the run that is gone on from has made of a module."""
+def _kept(options: Options, trained: Sequence[Stage]) -> list[Stage]:
+    """Return stages that take over what the run that is gone on from has trained; nothing is recorded for them."""
     assert options.before is not None
-    made = [*PRODUCTS.values(), WEIGHTS["estimator"].replace("second", "first")]
     found = list[Stage]()
-    for name in _TRAININGS[module]:
-        folder = options.before / name
-        products = [path for path in made if path.startswith(f"{name}/") and (options.before / path).exists()]
-        command = ("-m", keep.PROG, "--made", str(folder), "--out", str(options.run / name))
-        found.append(
-            Stage(
-                name, command, tuple(options.run / path for path in products), seconds=1.0, resumes=False,
-                sources=tuple(options.before / path for path in products),
-            )
-        )  # fmt: skip
+    for stage in trained:
+        if stage.command[1] == _RECORDER:
+            continue
+        name = stage.name
+        command = ("-m", keep.PROG, "--made", str(options.before / name), "--out", str(options.run / name))
+        sources = tuple(options.before / path.relative_to(options.run) for path in stage.products)
+        found.append(Stage(name, command, stage.products, seconds=1.0, resumes=False, sources=sources))
     return found
 
 
@@ -352,7 +344,7 @@ def _recording(options: Options, name: str) -> Stage:
     stream = len(_LEVELS) * options.seed + _LEVELS[name]
     seed = TRAIN_SEEDS.start + stream * 10**9
     command = (
-        "-m", "bringup.record", "--out", str(run / name), "--episodes", str(episodes),
+        "-m", _RECORDER, "--out", str(run / name), "--episodes", str(episodes),
         "--seed", str(seed), "--run-seed", str(stream), "--time-limit", str(limit),
         "--processes", str(cores), *_physics(options), "--look-ahead", "0", *sense, *modules,
     )  # fmt: skip

@@ -117,7 +117,7 @@ def test_a_planner_without_a_record_is_refused_before_anything_begins(tmp_path: 
 
 def test_modules_that_are_kept_are_those_of_the_run_before_and_the_others_go_on(tmp_path: Path) -> None:
     before, run = finished(tmp_path / "before"), tmp_path / "run"
-    (before / "estimator_first").mkdir()
+    (before / "estimator_first" / "weights").mkdir(parents=True)
     (before / "controller_mpo" / "checkpoint-1.json").touch()
     found = {stage.name: stage for stage in stages(Options(run=run, before=before, keep=("controller", "senses")))}
     trained = {name for name, stage in found.items() if stage.command[1] != bringup.keep.PROG}
