@@ -21,12 +21,11 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import tyro
-from rich.console import Console
 
 from bringup import keep
 from bringup.options import Count, WorldOptions, whole
 from bringup.pipeline import Pipeline, Stage
-from bringup.training_display import Display
+from bringup.training_display import run_shown
 from bringup.training_report import EVALUATIONS, write_report
 from bringup.training_sizes import Machine
 from mujoban_core.bodies import BALL, get_body
@@ -374,10 +373,7 @@ def train_all(options: Options) -> Path:
         Interrupted: If a signal came.
     """
     pipeline = Pipeline(options.run, stages(options), cores=options.cores)
-    display = Display(pipeline, Console(stderr=True))
-    with display.progress:
-        pipeline.run(display.update)
-        display.update(pipeline)
+    run_shown(pipeline)
     return write_report(options.run, pipeline, WEIGHTS)
 
 

@@ -51,6 +51,19 @@ class Display:
             self._told[stage.name] = state
 
 
+def run_shown(pipeline: Pipeline) -> None:
+    """Run a pipeline's stages that are not done yet, and show on stderr how far they are.
+
+    Raises:
+        PipelineError: If a stage fails.
+        Interrupted: If a signal came.
+    """
+    display = Display(pipeline, Console(stderr=True))
+    with display.progress:
+        pipeline.run(display.update)
+        display.update(pipeline)
+
+
 def _part(share: float) -> int:
     """Return how many tenths of its time a stage has taken; beyond its time only wholes count."""
     return int(10 * share) if share < 1.0 else 9 + int(share)

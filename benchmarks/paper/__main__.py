@@ -15,6 +15,7 @@ from typing import Final
 from benchmarks.paper import baselines, bodies, curves, figures, film, tables
 from benchmarks.paper.baselines import AGAIN, BASELINES, HOURS, JOINT, RECORDING
 from benchmarks.paper.runs import (
+    AHEAD,
     ALL,
     CONFIGURATIONS,
     DIFFICULTY,
@@ -24,7 +25,6 @@ from benchmarks.paper.runs import (
     POLICY_ALONE,
     RESULTS,
     SEED,
-    Run,
 )
 from mujoban_core.bodies import ANT, BALL
 from mujoban_core.program import read_options, run_command
@@ -53,7 +53,9 @@ and reports the best of many settings; here steps and CPU hours are what the row
 """
 BUDGETS = f"""Rows trained on nothing are the floor. Every other one but that of the stack as it ships is given the
 environment steps of the modular row and its {HOURS:g} h of two cores, whichever is spent first. Not counted are the
-recording of what is cloned, and the weights of the stack that ships where a row begins with them. The commands are
+recording of what is cloned, and the weights of the stack that ships where a row begins with them.
+`python -m benchmarks.paper.table1` trains and evaluates one row after the other, and goes on where it was stopped. Its
+commands are
 """
 EQUAL = """What equal budgets leave unequal: steps of the modular row are those of its controller's trainings and of its
 recordings; what its planner plays under the abstract rules costs CPU time alone. CPU hours compare rows of one machine:
@@ -62,7 +64,7 @@ its modules the controller is the one that solved the most validation levels, th
 weights; the senses, all agents and the stack fine-tuned as a whole are as their training left them. Agents that learn
 by MPO or cloning are of size S.
 """
-FIGURE_2 = """At every difficulty by the planner's policy alone; at difficulty 5 also the default, which searches ahead.
+FIGURE_2 = """At every difficulty by the planner's policy alone, and as by default, with its search ahead.
 """
 FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
 where one begins, and the axes of rates are cut. Of the controller they are its trainings as a camera policy, as a
@@ -128,8 +130,8 @@ def rebuild(folder: Path) -> Path:
         f"The learned one is trained by `{EXPLORING}`; its weights do not ship.\n",
         "## Figure 2: success against difficulty\n",
         FIGURE_2,
-        tables.configurations((*DIFFICULTY, CONFIGURATIONS[0])),
-        *_figure_2(DIFFICULTY, folder),
+        tables.configurations((*DIFFICULTY, *AHEAD)),
+        *_figure_2(folder),
         "## Figure 3: an episode\n",
         *_film_strip(BALL.name, "Figure 3", folder / "figure3.png"),
         "## Figure 4: learning curves\n",
@@ -154,8 +156,8 @@ def is_current(folder: Path) -> bool:
         return page.is_file() and page.read_text() == rebuild(Path(place)).read_text()
 
 
-def _figure_2(runs: Sequence[Run], folder: Path) -> list[str]:
-    if figures.difficulty(runs, folder / "figure2.png", CONFIGURATIONS[0]):
+def _figure_2(folder: Path) -> list[str]:
+    if figures.difficulty(DIFFICULTY, AHEAD, folder / "figure2.png"):
         return ["![Success rate against difficulty](figure2.png)\n"]
     return _missing("Figure 2", "python -m benchmarks.paper.runs")
 

@@ -33,37 +33,21 @@ _SAMPLES: Final = {"controller": "ticks played", "planner": "samples"}
 """What a module is trained on, in whose millions a curve is drawn; the others learn from recorded ticks."""
 
 
-def difficulty(runs: Sequence[Run], file: Path, ahead: Run | None = None) -> bool:
+def difficulty(alone: Sequence[Run], ahead: Sequence[Run], file: Path) -> bool:
     """Draw success against difficulty (paper Fig. 2); return False when nothing has been measured.
 
     Args:
-        runs: By the planner's policy alone.
+        alone: By the planner's policy alone.
+        ahead: By default, with its search ahead.
         file: The image.
-        ahead: One that searches ahead, which is drawn a little aside.
     """
-    reports = [(run, report) for run in runs if (report := load(run)) is not None]
+    reports = [(run, report) for run in (*alone, *ahead) if (report := load(run)) is not None]
     if not reports:
         return False
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
-    alone = f"all four modules learned, {DEFAULT_WORLD}\nworld, the planner's policy alone"
-    for stale, label in ((False, alone), (True, f"{alone},\nother weights than ship now")):
-        chosen = [(run, report) for run, report in reports if is_stale(report) == stale]
-        if chosen:
-            x = [run.difficulty for run, _ in chosen]
-            y = [report["success_rate"] for _, report in chosen]
-            low, high = zip(*(margins(report) for _, report in chosen), strict=True)
-            axes.errorbar(
-                x, y, yerr=[low, high], capsize=3, label=label, marker="o", color="tab:blue",
-                linestyle="none" if stale else "-", markerfacecolor="white" if stale else "tab:blue",
-            )  # fmt: skip
-    if ahead is not None and (report := load(ahead)) is not None:
-        bars = [[margin] for margin in margins(report)]
-        stale = is_stale(report)
-        axes.errorbar(
-            [ahead.difficulty + 0.1], [report["success_rate"]], yerr=bars, capsize=3, marker="D", color="tab:orange",
-            linestyle="none", markerfacecolor="white" if stale else "tab:orange",
-            label="the default, with the search ahead" + (", other weights" if stale else ""),
-        )  # fmt: skip
+    learned = f"all four modules learned, {DEFAULT_WORLD} world,\n"
+    _stack(axes, alone, f"{learned}the planner's policy alone", "tab:blue", "o", 0.0)
+    _stack(axes, ahead, f"{learned}the default, with the search ahead", "tab:orange", "D", 0.08)
     for row in BASELINES:
         measured = [(d, report) for d in DIFFICULTIES if (report := load(row.run(d))) is not None]
         if measured:
@@ -76,6 +60,23 @@ def difficulty(runs: Sequence[Run], file: Path, ahead: Run | None = None) -> boo
         axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, its world", zorder=3)
     save_rates(figure, axes, file)
     return True
+
+
+def _stack(axes: Axes, runs: Sequence[Run], label: str, colour: str, marker: str, aside: float) -> None:
+    """Draw a curve of the stack, a little aside; hollow points, not joined, were measured with other weights."""
+    reports = [(run, report) for run in runs if (report := load(run)) is not None]
+    for stale in (False, True):
+        chosen = [(run, report) for run, report in reports if is_stale(report) == stale]
+        if not chosen:
+            continue
+        x = [run.difficulty + aside for run, _ in chosen]
+        y = [report["success_rate"] for _, report in chosen]
+        low, high = zip(*(margins(report) for _, report in chosen), strict=True)
+        axes.errorbar(
+            x, y, yerr=[low, high], capsize=3, marker=marker, color=colour,
+            label=f"{label},\nother weights than ship now" if stale else label,
+            linestyle="none" if stale else "-", markerfacecolor="white" if stale else colour,
+        )  # fmt: skip
 
 
 def save_rates(figure: Figure, axes: Axes, file: Path) -> None:

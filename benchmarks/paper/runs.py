@@ -107,7 +107,9 @@ DIFFICULTY: Final = (
     *(Run(f"difficulty_{d}", f"difficulty {d}, the policy alone", d, further=ALONE) for d in range(1, 5)),
     POLICY_ALONE[0],
 )
-"""The points of Figure 2, difficulty 1 to 5."""
+"""The points of Figure 2, difficulty 1 to 5, by the planner's policy alone."""
+AHEAD: Final = (*(Run(f"default_{d}", f"difficulty {d}", d) for d in range(1, 5)), CONFIGURATIONS[0])
+"""The same as by default, with its search ahead."""
 GRAPH: Final = Run("graph", "default, through the ROS graph", further=("--graph",))
 """The headline row as users run it."""
 LOOKING_AROUND: Final = (
@@ -120,7 +122,7 @@ LOOKING_AROUND: Final = (
 )
 """What says where to look before pushing: nothing, the rule that ships, a network that does not ship."""
 ALL: Final = (
-    *CONFIGURATIONS, *POLICY_ALONE, *DIFFICULTY[:-1], GRAPH,
+    *CONFIGURATIONS, *POLICY_ALONE, *AHEAD[:-1], *DIFFICULTY[:-1], GRAPH,
     *(run for run in LOOKING_AROUND if run is not CONFIGURATIONS[0]),
 )  # fmt: skip
 

@@ -19,8 +19,8 @@ def test_without_sources_the_page_names_the_commands_that_make_them(folder, caps
     assert "Rows are of the *reference* world" in page
     assert "python -m benchmarks.paper.runs --only film_strip" in page
     assert "python -m benchmarks.paper.curves --controller RUN" in page
-    assert page.count("not measured |") == 98, (
-        "two rows of Table 1, three of Table 2 and six beside, six of Figure 2, sixteen of Figure 5, thirteen agents "
+    assert page.count("not measured |") == 102, (
+        "two rows of Table 1, three of Table 2 and six beside, ten of Figure 2, sixteen of Figure 5, thirteen agents "
         "at five difficulties"
     )
     assert "no source yet" in capsys.readouterr().err
