@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 
 from mujoban_controller.judge import judge
 from mujoban_controller.policy import GoalPolicy
-from mujoban_rl.best import JudgedLearner
+from mujoban_rl.best import JudgedLearner, judged
 from mujoban_rl.engine import Scalars
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_sim.oracles import OraclePlanner
@@ -54,13 +54,11 @@ class ProductLearner(JudgedLearner[BatchT]):
         where, product = self._validation, self.product
         if not where.episodes:
             return {}
-        training = product.training
-        product.eval()
-        report = judge(
-            product.driver(), OraclePlanner(), episodes=where.episodes, first_seed=VALIDATION_SEEDS.start,
-            body=where.body, difficulty=where.difficulty, world=where.world, batch=128, threads=where.threads,
-        )  # fmt: skip
-        product.train(training)
+        with judged(product):
+            report = judge(
+                product.driver(), OraclePlanner(), episodes=where.episodes, first_seed=VALIDATION_SEEDS.start,
+                body=where.body, difficulty=where.difficulty, world=where.world, batch=128, threads=where.threads,
+            )  # fmt: skip
         feasible = report["instructions"]["feasible"]
         score = (report["success_rate"], feasible["completed"] / max(feasible["n"], 1))
         kinds = report["instructions"]["kinds"]

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.validation import success_rates
-from mujoban_rl.best import JudgedLearner
+from mujoban_rl.best import JudgedLearner, judged
 from mujoban_rl.run_directory import RunDirectory
 
 BatchT = TypeVar("BatchT")
@@ -28,10 +28,8 @@ class PlannerLearner(JudgedLearner[BatchT]):
     def evaluate(self) -> dict[str, float]:
         """Return the planner's solve rates, alone, on held-out levels; keep it if that makes it the best."""
         product = self.product
-        training = product.training
-        product.eval()
-        rates = success_rates(product)
-        product.train(training)
+        with judged(product):
+            rates = success_rates(product)
         if self.chooses:
             self.best.judge(product, tuple(rates.values()), rates)
         return rates

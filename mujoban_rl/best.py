@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, TypeVar
@@ -28,14 +30,16 @@ class Best:
         self._judged = 0
 
     def judge(self, product: nn.Module, score: tuple[float, ...], scalars: Scalars) -> None:
-        """Keep a product unless an earlier one has scored more.
+        """Keep a product unless an earlier one has scored more, or its score is not a number.
 
         Args:
             product: As it is now.
             score: What products are compared by, in this order; the newest of equal ones is kept.
             scalars: What the evaluation found.
         """
-        if self._score is None or score >= self._score:
+        # Nothing is more than one that is not a number: once kept, it would stay.
+        sound = not any(map(math.isnan, score))
+        if sound and (self._score is None or score >= self._score):
             self._score, self._scalars, self._at = score, scalars, self._judged
             self._weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
         self._judged += 1
@@ -67,6 +71,15 @@ class Best:
         self._score = None if score is None else tuple(score)
         self._weights, self._scalars = state.tensors, state.values["scalars"]
         self._at, self._judged = state.values["at"], state.values["evaluations"]
+
+
+@contextmanager
+def judged(product: nn.Module) -> Iterator[None]:
+    """Have a product in evaluation mode meanwhile, as it plays where it is used."""
+    training = product.training
+    product.eval()
+    yield
+    product.train(training)
 
 
 class JudgedLearner(Learner[BatchT]):

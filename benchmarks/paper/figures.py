@@ -48,6 +48,8 @@ def difficulty(alone: Sequence[Run], ahead: Sequence[Run], file: Path) -> bool:
     learned = f"all four modules learned, {DEFAULT_WORLD} world,\n"
     _stack(axes, alone, f"{learned}the planner's policy alone", "tab:blue", "o", 0.0)
     _stack(axes, ahead, f"{learned}the default, with the search ahead", "tab:orange", "D", 0.08)
+    # The first four are the stack's two colours, dark and pale.
+    axes.set_prop_cycle(color=plt.get_cmap("tab20").colors[4:])  # pyright: ignore[reportAttributeAccessIssue]
     for row in BASELINES:
         measured = [(d, report) for d in DIFFICULTIES if (report := load(row.run(d))) is not None]
         if measured:

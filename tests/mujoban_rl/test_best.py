@@ -1,3 +1,5 @@
+import math
+
 import torch
 from torch import nn
 
@@ -34,3 +36,11 @@ def test_without_a_judgement_the_present_product_is_the_best():
     best.restore(best.state())
     torch.testing.assert_close(dict(best.chosen(present).state_dict()), dict(present.state_dict()))
     assert best.told == {"validation": None, "evaluation": None}
+
+
+def test_a_score_that_is_not_a_number_is_never_the_best():
+    best = Best()
+    for value, score in enumerate([(math.nan,), (0.1,), (0.2, math.nan), (0.0,)]):
+        best.judge(product(float(value)), score, {"rate": score[0]})
+    assert best.chosen(product(8.0)).weight.item() == 1.0
+    assert best.told == {"validation": {"rate": 0.1}, "evaluation": 1}
