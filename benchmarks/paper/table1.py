@@ -41,7 +41,7 @@ class Options:
     """Names of rows; by default all but those with another seed, the modular one first, as its steps are the others'
     budget."""
     run: Path = Path("runs/table1")
-    """Where it is kept what is done; the trainings have folders of their own, `runs/baselines/NAME`."""
+    """Where what is done is noted; the trainings have folders of their own, `runs/baselines/NAME`."""
 
     def __post_init__(self) -> None:
         """Reject unknown rows, and a folder in which the commands would not find what they name."""
