@@ -24,6 +24,7 @@ from benchmarks.paper.runs import (
     LOOKING_AROUND,
     POLICY_ALONE,
     RESULTS,
+    SCOUT_FOLDER,
     SEED,
 )
 from mujoban_core.bodies import ANT, BALL
@@ -127,7 +128,7 @@ def rebuild(folder: Path) -> Path:
         tables.differences(CONFIGURATIONS[0], GRAPH),
         "What says where to look before pushing:\n",
         tables.configurations(LOOKING_AROUND),
-        f"The learned one is trained by `{EXPLORING}`; its weights do not ship.\n",
+        f"The learned one was trained by `{EXPLORING}`; its weights do not ship, and lie in `{SCOUT_FOLDER}/`.\n",
         "## Figure 2: success against difficulty\n",
         FIGURE_2,
         tables.configurations((*DIFFICULTY, *AHEAD)),

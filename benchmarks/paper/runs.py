@@ -30,6 +30,8 @@ DIGEST_LENGTH: Final = 64
 """Characters of a digest of weights; what is shorter names a class that stands in."""
 EXPLORING: Final = "python -m mujoban_planner.train explorer --run runs/explorer"
 """Trains the scout that says where to look."""
+SCOUT_FOLDER: Final = "docs/research/explorer"
+"""Where its weights lie, which do not ship."""
 
 
 class ResultError(ValueError):
@@ -116,7 +118,7 @@ LOOKING_AROUND: Final = (
     Run("look_around_none", "none", further=("--look-around", "0")),
     CONFIGURATIONS[0],
     Run(
-        "look_around_learned", "learned", modules=((SCOUT, ROOT / "runs" / "explorer" / "explorer.safetensors"),),
+        "look_around_learned", "learned", modules=((SCOUT, ROOT / SCOUT_FOLDER / "explorer.safetensors"),),
         training=EXPLORING,
     ),
 )
