@@ -24,7 +24,7 @@ from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.testing import check_refusal, check_resuming
 
-TASK = TaskConfig(levels="easy", robots=2, episode_seconds=1.2)
+TASK = TaskConfig(levels="easy", robots=2, episode_seconds=2.4)
 CONTROLLER = MPOTrainingConfig(
     window=4, windows=2, sequence=4, replay=60, first=80, reuse=2.0, n_step=1, samples=2, target_period=2, explore=0.2,
 )  # fmt: skip

