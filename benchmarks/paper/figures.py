@@ -41,13 +41,13 @@ def difficulty(alone: Sequence[Run], ahead: Sequence[Run], file: Path) -> bool:
         ahead: By default, with its search ahead.
         file: The image.
     """
-    reports = [(run, report) for run in (*alone, *ahead) if (report := load(run)) is not None]
-    if not reports:
+    measured_alone, measured_ahead = _measured(alone), _measured(ahead)
+    if not (measured_alone or measured_ahead):
         return False
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
     learned = f"all four modules learned, {DEFAULT_WORLD} world,\n"
-    _stack(axes, alone, f"{learned}the planner's policy alone", "tab:blue", "o", 0.0)
-    _stack(axes, ahead, f"{learned}the default, with the search ahead", "tab:orange", "D", 0.08)
+    _stack(axes, measured_alone, f"{learned}the planner's policy alone", "tab:blue", "o", 0.0)
+    _stack(axes, measured_ahead, f"{learned}the default, with the search ahead", "tab:orange", "D", 0.08)
     # The first four are the stack's two colours, dark and pale.
     axes.set_prop_cycle(color=plt.get_cmap("tab20").colors[4:])  # pyright: ignore[reportAttributeAccessIssue]
     for row in BASELINES:
@@ -57,16 +57,23 @@ def difficulty(alone: Sequence[Run], ahead: Sequence[Run], file: Path) -> bool:
             bars = list(zip(*(margins(report) for _, report in measured), strict=True))
             x = [d for d, _ in measured]
             axes.errorbar(x, rates, yerr=bars, capsize=2, marker=".", linewidth=1, label=row.label)
-    paper = [(run.difficulty, run.paper_success) for run, _ in reports if run.paper_success is not None]
+    shown = (*measured_alone, *measured_ahead)
+    paper = {(run.difficulty, run.paper_success) for run, _ in shown if run.paper_success is not None}
     if paper:
         axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, its world", zorder=3)
     save_rates(figure, axes, file)
     return True
 
 
-def _stack(axes: Axes, runs: Sequence[Run], label: str, colour: str, marker: str, aside: float) -> None:
+def _measured(runs: Sequence[Run]) -> list[tuple[Run, dict[str, Any]]]:
+    """Return evaluations that have been run, with their reports."""
+    return [(run, report) for run in runs if (report := load(run)) is not None]
+
+
+def _stack(
+    axes: Axes, reports: Sequence[tuple[Run, dict[str, Any]]], label: str, colour: str, marker: str, aside: float
+) -> None:
     """Draw a curve of the stack, a little aside; hollow points, not joined, were measured with other weights."""
-    reports = [(run, report) for run in runs if (report := load(run)) is not None]
     for stale in (False, True):
         chosen = [(run, report) for run, report in reports if is_stale(report) == stale]
         if not chosen:

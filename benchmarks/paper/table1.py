@@ -75,11 +75,11 @@ def stages(baseline: Baseline) -> list[Stage]:
 def _trainings(baseline: Baseline) -> Iterator[Stage]:
     """Yield the trainings of a row, each of which begins with what the one before has made."""
     needs: tuple[str, ...] = ()
-    for text in baseline.commands:
-        _, *command = shlex.split(text)
+    commands = [shlex.split(text)[1:] for text in baseline.commands]
+    for command in commands:
         folder = Path(command[command.index("--run") + 1])
         # What the last one makes is what plays; one before it makes an agent to start from.
-        last = text == baseline.commands[-1]
+        last = command is commands[-1]
         products = tuple(baseline.run(1).own.values()) if last else (folder / "agent.safetensors",)
         yield Stage(folder.name, tuple(command), products, needs, HOURS * 3600.0, _BOTH)
         needs = (folder.name,)
@@ -88,7 +88,7 @@ def _trainings(baseline: Baseline) -> Iterator[Stage]:
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = read_options(Options, command_line, PROG, __doc__)
-    chosen = [KNOWN[name] for name in options.only or (baseline.name for baseline in BASELINES)]
+    chosen = [KNOWN[name] for name in options.only] or BASELINES
     if any("--bags" in command for baseline in chosen for command in baseline.commands):
         run_shown(Pipeline(options.run / _BAGS, [recording()]))
     for baseline in chosen:

@@ -60,7 +60,7 @@ def test_figures_name_their_axes_their_bars_and_each_curve_in_words(folder, draw
     (axes,) = drawn()
     assert axes.get_legend().get_title().get_text() == "bars: 95 % intervals (Wilson)"
     _, alone, default = words(axes)
-    assert alone.endswith("the planner's policy alone") and default.endswith("the default, with the search ahead")
+    assert alone.endswith("the planner's policy alone") and default.endswith(",\nthe default, with the search ahead")
     beside = ("planner", "planner_mpo", "estimator", "estimator_mpo")
     for name in ("controller", "controller_mpo", "controller_other_way", *beside):
         points = [{"step": 1000 * i, "value": i / 3, "what": "instructions completed"} for i in range(4)]
