@@ -43,6 +43,8 @@ class Options:
     """Measure answers in real time at this speed, without and with a search ahead; 0: throughput in lockstep."""
     look_ahead: int = 400
     """Evaluations of that search."""
+    intra_process: bool = True
+    """Whether nodes hand over messages that nobody else reads, as `run_stack.py` does; else the middleware has all."""
     physics: Annotated[WorldOptions, arg(name="")] = field(default_factory=WorldOptions)
 
     def stack(self, look_ahead: int | None = None) -> Stack:
@@ -52,7 +54,12 @@ class Options:
 
     def play_options(self) -> PlayOptions:
         """Return how the graph is run."""
-        return PlayOptions(world=self.physics.world, realtime=self.realtime, time_limit=self.ticks)
+        return PlayOptions(
+            world=self.physics.world,
+            realtime=self.realtime,
+            time_limit=self.ticks,
+            intra_process=self.intra_process,
+        )
 
 
 def _in_process(policy: SensePlanAct, episodes: Episodes, options: Options) -> float:

@@ -129,7 +129,8 @@ def _play(
             from bringup.stack import PlayOptions
             from bringup.stack import play as play_graph
 
-            how = PlayOptions(world=play.world, time_limit=play.time_limit)
+            # A result through the graph is one of messages that were sent.
+            how = PlayOptions(world=play.world, time_limit=play.time_limit, intra_process=False)
             outcome = play_graph(stack, episodes, how, on_refresh=lambda _, ended: show(ended), refresh_period=1.0)
             return outcome.results, outcome.figures()
         if policy is None:

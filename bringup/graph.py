@@ -27,6 +27,7 @@ from mujoban_core.program import USAGE_ERROR
 from mujoban_estimator.node import EstimatorNode
 from mujoban_estimator.termination_node import TerminationNode
 from mujoban_msgs_py.listening import LEASE
+from mujoban_msgs_py.runtime.intra_process import IntraProcess
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.shared_memory import RunFolder, clear_shared_memory
 from mujoban_planner.node import PlannerNode
@@ -68,22 +69,30 @@ class InProcess:
     Attributes:
         executor: Runs the nodes.
         nodes: The nodes of the graph by name.
+        intra_process: Hands over messages between nodes that are made with it; None: all go through the middleware.
     """
 
     def __init__(
-        self, parameters: Parameters, names: Iterable[str] = NODES, *, context: Context | None = None
+        self,
+        parameters: Parameters,
+        names: Iterable[str] = NODES,
+        *,
+        intra_process: bool = True,
+        context: Context | None = None,
     ) -> None:
         """Start the named nodes of the graph.
 
         Args:
             parameters: Of each node.
             names: Nodes to start.
+            intra_process: Whether these nodes hand over messages while nobody else reads them.
             context: The ROS context, if not the default one.
 
         Raises:
             ValueError: If a module or what a parameter names is bad.
         """
         self.executor = EventsExecutor(context=context)
+        self.intra_process = IntraProcess() if intra_process else None
         self.nodes: dict[str, GraphNode] = {}
         self._parameters = parameters
         self._context = context
@@ -107,7 +116,9 @@ class InProcess:
     def start(self, name: str) -> None:
         """Start a node of the graph."""
         overrides = [Parameter(key, value=value) for key, value in self._parameters[name].items()]
-        self.nodes[name] = _KINDS[name](parameter_overrides=overrides, context=self._context)
+        self.nodes[name] = _KINDS[name](
+            parameter_overrides=overrides, context=self._context, intra_process=self.intra_process
+        )
         self.executor.add_node(self.nodes[name])
 
     def stop(self, name: str) -> None:

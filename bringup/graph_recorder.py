@@ -12,7 +12,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
 from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.listening import Received, listen
-from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
+from mujoban_msgs_py.runtime.descriptors import RclpyOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
@@ -29,7 +29,7 @@ class RecorderNode(GraphNode):
 
     A tick is written when all its topics have arrived; then `/recorded` says so. A simulator that awaits this in
     lockstep loses nothing. In real time a tick is written as it is when it has become too old, and what it lacks is
-    counted. Repeated messages are written once.
+    counted. Repeated messages are written once. What it records goes through the middleware: a bag holds what is sent.
 
     Parameters:
         path: Folder of the bag, which must not exist yet.
@@ -43,7 +43,7 @@ class RecorderNode(GraphNode):
         written: Stamp of the latest tick in the bag [ns].
     """
 
-    def __init__(self, **options: Unpack[NodeOptions]) -> None:
+    def __init__(self, **options: Unpack[RclpyOptions]) -> None:
         """Make the bag and start listening.
 
         Raises:
@@ -68,7 +68,7 @@ class RecorderNode(GraphNode):
         self._ticks: dict[int, dict[str, bytes]] = {}
         self._last_ticks: set[int] = set()
         self.written = 0
-        self._acknowledge = self.create_publisher(RECORDED.type, RECORDED.name, RECORDED.qos)
+        self._acknowledge = self.create_output(RECORDED)
         for topic in GRAPH_TOPICS.values():
             listen(self, topic, self._receiver(topic.name), qos=live_qos(QUEUE_DEPTH))
 

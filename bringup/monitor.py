@@ -126,7 +126,7 @@ class MonitorNode(GraphNode):
         for topic in watched:
             steady = topic == topics.TRUE_ABSTRACT_STATE
             listen(self, topic, partial(self._receive, topic.name), qos=qos, steady=steady)
-        self._acknowledge = self.create_publisher(topics.MONITORED.type, topics.MONITORED.name, topics.MONITORED.qos)
+        self._acknowledge = self.create_output(topics.MONITORED)
         self.watch = PublisherWatch(self, topics.PUBLISHERS | ({topics.TORQUE.name: AGENT} if alone else {}))
 
     @property
@@ -191,7 +191,7 @@ class MonitorNode(GraphNode):
 
     def _confirm(self) -> None:
         """Say that the latest tick was heard, once it was; in one process nobody asks."""
-        if self.episode is None or not self._acknowledge.get_subscription_count():
+        if self.episode is None or not self._acknowledge.subscriptions:
             return
         if self._joined >= self.stamp or self.episode.terminated or self.episode.truncated:
             self._acknowledge.publish(conversions.header(self.stamp))

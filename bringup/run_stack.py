@@ -36,6 +36,8 @@ class Options:
     """Pace the world by the clock, SPEED (1) times as fast as reality, instead of in lockstep."""
     processes: bool = False
     """Run each node in a process of its own."""
+    intra_process: bool = True
+    """Hand messages over within the process while nobody outside reads their topic; without, the middleware has all."""
     headless: bool = False
     """Show no live view."""
     record: FolderPath = None
@@ -80,6 +82,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         realtime=options.realtime,
         time_limit=play.time_limit,
         processes=options.processes,
+        intra_process=options.intra_process,
         record=options.record,
         episodes_per_file=options.episodes_per_file,
         video=options.video,

@@ -57,6 +57,8 @@ class PlayOptions:
     """Steps of an episode; None means that of the body."""
     processes: bool = False
     """One process for each node."""
+    intra_process: bool = True
+    """Messages of which nobody outside this process hears are handed over, not sent."""
     record: Path | None = None
     """Folder of the bag to write."""
     episodes_per_file: int = 32
@@ -127,15 +129,18 @@ def play(
         clear_shared_memory()
         exits.enter_context(claim_domain())
         exits.enter_context(ros_context())
-        graph = exits.enter_context(InProcess(parameters, () if options.processes else parameters))
+        graph = exits.enter_context(
+            InProcess(parameters, () if options.processes else parameters, intra_process=options.intra_process)
+        )
         alone = isinstance(stack, Solo)
-        monitor = graph.add(MonitorNode(episodes, alone=alone, run=options.run))
+        monitor = graph.add(MonitorNode(episodes, alone=alone, run=options.run, intra_process=graph.intra_process))
         stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:
             listeners.append(graph.add(_recorder(options.record, options, stack.body, instructed=not alone)))
         if options.video is not None:
-            listeners.append(graph.add(VideoNode(options.video, alone=alone, run=options.run)))
+            video = VideoNode(options.video, alone=alone, run=options.run, intra_process=graph.intra_process)
+            listeners.append(graph.add(video))
         if options.view is not None:
             exits.enter_context(viewer(options.view, options.run))
         if options.processes:

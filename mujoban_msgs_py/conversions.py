@@ -5,7 +5,8 @@ size and values that are not finite raise `ConversionError`, so that nothing bad
 The readers take what rclpy delivers and what `rosbags` deserialises alike. Round trips are exact.
 
 Array fields are filled with `array.array`: all else is 1,000 times slower. Scalars are Python's: NumPy's get corrupted.
-A message makes its parts itself, also those that its constructor is given: so they are filled where they are.
+A message makes its parts itself, also those that its constructor is given: so they are filled where they are. Numbers
+are rounded to the field's type at once, so that a message that is handed over says what a serialised one does.
 """
 
 from __future__ import annotations
@@ -243,7 +244,7 @@ def termination_to_msg(
     return Termination(
         header=header,
         sequence=int(sequence),
-        probability=_probability(probability),
+        probability=_probability(np.float32(probability)),
         terminated=bool(terminated),
         timed_out=bool(timed_out),
     )
@@ -331,7 +332,7 @@ class EpisodeTruthReading(NamedTuple):
 
 def episode_truth_to_msg(header: Header, reading: EpisodeTruthReading) -> EpisodeTruth:
     """Return the truth about an episode."""
-    reward, total = _finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float64).tolist()
+    reward, total = _finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float32).tolist()
     return EpisodeTruth(
         header=header,
         episode=int(reading.episode),
@@ -387,7 +388,7 @@ def _check_probability(what: str, values: NDArray[np.float32]) -> None:
         raise ConversionError(f"{what} must hold probabilities in [0, 1], got {values.min()} to {values.max()}")
 
 
-def _probability(value: float) -> float:
+def _probability(value: float | np.float32) -> float:
     if not 0.0 <= (probability := float(value)) <= 1.0:
         raise ConversionError(f"probability must lie in [0, 1], got {probability}")
     return probability

@@ -9,17 +9,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
+from mujoban_msgs_py.arrivals import Arrival, Handed, Receive, Serialised
 from mujoban_msgs_py.decoders import DECODERS, Decode
-from mujoban_msgs_py.raw import Steady, raw_stamp, read
+from mujoban_msgs_py.raw import Steady
 from mujoban_msgs_py.run_identifier import ANY, run_of
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.topics import PUBLISHERS, Topic
+
+if TYPE_CHECKING:
+    from mujoban_msgs_py.runtime.intra_process import IntraProcess
 
 WATCH_PERIOD: Final = 1.0
 """Seconds between two looks at who publishes."""
@@ -44,7 +48,27 @@ class Received(NamedTuple):
     content: Any
     """What the reader of the topic made of it."""
     raw: bytes
-    """CDR."""
+    """CDR; empty if a node of the same process has handed the message over."""
+
+
+def subscribe(node: Node, topic: Topic, receive: Receive, qos: QoSProfile | None = None) -> Subscription:
+    """Subscribe to a topic of the graph, also to what nodes of the same process hand over.
+
+    Args:
+        node: Who subscribes; if it has an `intra_process`, that hands over.
+        topic: The topic.
+        receive: Called with every message.
+        qos: The topic's own by default.
+    """
+    chosen = qos or topic.qos
+    between: IntraProcess | None = getattr(node, "intra_process", None)
+    if between is not None:
+        between.read(node, topic, receive, chosen.depth)
+
+    def on_message(message: bytes) -> None:
+        receive(Serialised(message, topic.type))
+
+    return node.create_subscription(topic.type, topic.name, on_message, chosen, raw=True)
 
 
 def listen(
@@ -70,17 +94,20 @@ def listen(
     reader = DECODERS[topic] if decode is None else decode
     repeated = Steady(topic.type, reader) if steady else None
 
-    def on_message(message: bytes) -> None:
+    def on_message(message: Arrival) -> None:
         try:
-            stamp = raw_stamp(message)
-            content = read(message, topic.type, reader) if repeated is None else repeated(message)
+            stamp = message.stamp
+            if repeated is None or isinstance(message, Handed):
+                content = message.content(reader)
+            else:
+                content = repeated(message.raw)
         except ValueError as error:
             reject(node, topic.name, error)
             return
         if belongs(node, topic.name, stamp):
-            receive(Received(stamp, content, message))
+            receive(Received(stamp, content, message.raw))
 
-    return node.create_subscription(topic.type, topic.name, on_message, qos or topic.qos, raw=True)
+    return subscribe(node, topic, on_message, qos)
 
 
 def reject(node: Node, topic: str, reason: object) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Image
 
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.topics import Topic
 from mujoban_sim.tick_messages import EpisodeProgress, SimulatorTick, TickComposer, TickLabel
 from mujoban_sim.world import World
@@ -25,7 +25,7 @@ class ObservationPublisher:
     above only now and then while nobody needs all of it.
     """
 
-    def __init__(self, node: Node, world: World, top_camera_size: int) -> None:
+    def __init__(self, node: GraphNode, world: World, top_camera_size: int) -> None:
         """Make the publishers of `topics.SIMULATOR_TOPICS` on a node."""
         if world.batch != 1:
             raise ValueError(f"world has {world.batch} rows: the graph plays 1")
@@ -33,14 +33,14 @@ class ObservationPublisher:
         self._world = world
         self._top_camera_size = top_camera_size
         self._composer = TickComposer(world.body)
-        self._publishers = {t: node.create_publisher(t.type, t.name, t.qos) for t in topics.SIMULATOR_TOPICS}
+        self._publishers = {topic: node.create_output(topic) for topic in topics.SIMULATOR_TOPICS}
         self._on_demand = {*topics.SIMULATOR_TOPICS} - {*_NEEDED, topics.TRUE_EPISODE}
         self._top_readers, self._top_period = 0, 1
 
     def matched(self, *, everything: bool) -> bool:
         """Tell whether somebody hears what the modules need, or everything."""
         needed = self._publishers if everything else _NEEDED
-        return all(self._publishers[topic].get_subscription_count() for topic in needed)
+        return all(self._publishers[topic].subscriptions for topic in needed)
 
     def publish(self, label: TickLabel) -> None:
         """Publish the world as it is now."""
@@ -66,7 +66,7 @@ class ObservationPublisher:
         return SimulatorTick(label, progress, observation, truth, 0)
 
     def _is_wanted(self, topic: Topic, stamp: int) -> bool:
-        readers = self._publishers[topic].get_subscription_count()
+        readers = self._publishers[topic].subscriptions
         if topic is not topics.TOP_CAMERA:
             return readers > 0
         if not readers:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypedDict, TypeVar, cast
+from typing import TYPE_CHECKING, TypedDict, TypeVar, cast
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.context import Context
@@ -12,14 +12,24 @@ from rclpy.parameter import Parameter
 from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.topics import TICK
 
+if TYPE_CHECKING:
+    from mujoban_msgs_py.runtime.intra_process import IntraProcess
+
 ValueT = TypeVar("ValueT", bool, int, float, str)
 
 
-class NodeOptions(TypedDict, total=False):
+class RclpyOptions(TypedDict, total=False):
     """The options of rclpy's `Node` that nodes here are made with."""
 
     context: Context | None
     parameter_overrides: list[Parameter]
+
+
+class NodeOptions(RclpyOptions, total=False):
+    """What nodes here are made with."""
+
+    intra_process: IntraProcess | None
+    """Hands over messages between nodes of this process; None: all go through the middleware."""
 
 
 def described(

@@ -1,9 +1,9 @@
-"""What all nodes of the graph have in common: an end, timers on wall time, and services that no request breaks."""
+"""What all nodes of the graph have in common: an end, timers on wall time, outputs, services that no request breaks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Unpack
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -13,6 +13,9 @@ from rclpy.service import Service
 from rclpy.timer import Timer
 
 from mujoban_msgs_py.listening import reject
+from mujoban_msgs_py.runtime.descriptors import RclpyOptions
+from mujoban_msgs_py.runtime.intra_process import IntraProcess, TopicPublisher
+from mujoban_msgs_py.topics import Topic
 
 
 class GraphNode(Node):
@@ -23,14 +26,30 @@ class GraphNode(Node):
 
     Attributes:
         ended: Whether it was destroyed; callbacks of subscriptions ask for it themselves.
+        intra_process: Hands over messages between nodes of this process, if they do not go through the middleware.
     """
 
     ended = False
 
+    def __init__(
+        self, name: str, *, intra_process: IntraProcess | None = None, **options: Unpack[RclpyOptions]
+    ) -> None:
+        """Make the node."""
+        self.intra_process = intra_process
+        super().__init__(name, **options)
+        if self.intra_process is not None:
+            self.intra_process.join(self)
+
     def destroy_node(self) -> None:
         """End the node; what an executor still has in its queue for it is left alone."""
         self.ended = True
+        if self.intra_process is not None:
+            self.intra_process.leave(self)
         super().destroy_node()
+
+    def create_output(self, topic: Topic) -> TopicPublisher:
+        """Return a publisher of a topic of the graph."""
+        return TopicPublisher(self, topic, self.intra_process)
 
     def create_timer(
         self, timer_period_sec: float, callback: Callable[[], object], *args: Any, **options: Any

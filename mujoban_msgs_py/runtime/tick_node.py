@@ -24,21 +24,21 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from mujoban_core.children import end_with_parent
 from mujoban_core.signals import StopSignal, interruptible
+from mujoban_msgs_py.arrivals import Arrival
 from mujoban_msgs_py.decoders import checked
-from mujoban_msgs_py.listening import belongs, reject
-from mujoban_msgs_py.raw import raw_stamp, read
+from mujoban_msgs_py.listening import belongs, reject, subscribe
 from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.discovery import chosen_domain, confine_discovery
 from mujoban_msgs_py.runtime.graph_node import GraphNode
+from mujoban_msgs_py.runtime.intra_process import TopicPublisher
 from mujoban_msgs_py.runtime.shared_memory import mapped_segments, release_segments
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
@@ -62,7 +62,7 @@ class Input(NamedTuple):
 class Output(NamedTuple):
     """A message to publish."""
 
-    publisher: Publisher
+    publisher: TopicPublisher
     message: Message | bytes
     """Bytes are one that is serialised already."""
 
@@ -126,11 +126,7 @@ class TickNode(GraphNode):
         for topic, decode in every:
             receive = partial(self._receive, topic, decode)
             # What was said before this node came belongs to ticks that are over; the open one is offered again.
-            self.create_subscription(topic.type, topic.name, receive, live_qos(), raw=True)
-
-    def create_output(self, topic: Topic) -> Publisher:
-        """Return a publisher of a topic."""
-        return self.create_publisher(topic.type, topic.name, topic.qos)
+            subscribe(self, topic, receive, live_qos())
 
     def keep(self, stamp: int, outputs: Sequence[Output]) -> None:
         """Note that a tick is answered, before anybody else knows; `take_up` goes on from there."""
@@ -159,14 +155,14 @@ class TickNode(GraphNode):
         self.keep(stamp, outputs)
         self._publish()
 
-    def _receive(self, topic: Topic, decode: Callable[[Any], Any] | None, message: bytes) -> None:
+    def _receive(self, topic: Topic, decode: Callable[[Any], Any] | None, message: Arrival) -> None:
         if self.ended:
             return
         try:
-            stamp = raw_stamp(message)
+            stamp = message.stamp
             if stamp <= self._handled and topic is not EPISODE:
                 return
-            item = read(message, topic.type, decode)
+            item = message.content(decode)
         except ValueError as error:
             reject(self, topic.name, error)
             return

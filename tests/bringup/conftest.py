@@ -7,8 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import pytest
-from mujoban_msgs.msg import EpisodeTruth, Instruction
-from rclpy.node import Node
+from mujoban_msgs.msg import EpisodeTruth
 
 from bringup.command import Choice, Stack
 from bringup.graph import NODES, InProcess, keep_memories
@@ -16,8 +15,9 @@ from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_core.plugins import ROLES
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.conversions import stamp_of
+from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import listen
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos
 from mujoban_sokoban.episodes import Episodes
 
@@ -35,26 +35,27 @@ class Said:
     episodes: dict[int, EpisodeTruth] = field(default_factory=dict)
 
 
-class Tap(Node):
+class Tap(GraphNode):
     """Notes estimates, instructions, torques and rewards."""
 
-    def __init__(self):
-        super().__init__("tap")
+    def __init__(self, intra_process=None):
+        super().__init__("tap", intra_process=intra_process)
         self.said = Said()
-        self.create_subscription(EpisodeTruth, topics.TRUE_EPISODE.name, self._episode, live_qos(1000))
-        self.create_subscription(Instruction, topics.INSTRUCTION.name, self._instruction, live_qos(1000))
-        listen(self, topics.ABSTRACT_STATE, self._estimate, qos=live_qos(1000))
-        listen(self, topics.TORQUE, self._torque, qos=live_qos(1000))
+        qos = live_qos(1000)
+        listen(self, topics.TRUE_EPISODE, self._episode, qos=qos, decode=checked(topics.TRUE_EPISODE))
+        listen(self, topics.INSTRUCTION, self._instruction, qos=qos)
+        listen(self, topics.ABSTRACT_STATE, self._estimate, qos=qos)
+        listen(self, topics.TORQUE, self._torque, qos=qos)
 
     def _episode(self, message):
-        self.said.episodes[stamp_of(message)] = message
-        self.said.reward[stamp_of(message)] = message.reward
+        self.said.episodes[message.stamp] = message.content
+        self.said.reward[message.stamp] = message.content.reward
 
     def _instruction(self, message):
-        self.said.instruction[stamp_of(message)] = (message.sequence, message.direction)
+        self.said.instruction[message.stamp] = tuple(message.content)
 
     def _estimate(self, message):
-        self.said.estimate[message.stamp] = message.raw
+        self.said.estimate[message.stamp] = message.content.tobytes()
 
     def _torque(self, message):
         self.said.torque[message.stamp] = message.content.tolist()
@@ -63,15 +64,16 @@ class Tap(Node):
 class Play:
     """A running graph."""
 
-    def __init__(self, stack: Stack, episodes: Episodes, names=NODES, memories=None, **simulator):
+    def __init__(self, stack: Stack, episodes: Episodes, names=NODES, memories=None, intra_process=True, **simulator):
         simulator.setdefault("resend_after", 0.2)
         self.parameters = graph_parameters(stack, episodes, **simulator)
         if memories is not None:
             keep_memories(self.parameters, dict.fromkeys(self.parameters, memories))
-        self.graph = InProcess(self.parameters, ())
+        self.graph = InProcess(self.parameters, (), intra_process=intra_process)
         self._open = True
-        self.tap = self.graph.add(Tap())
-        self.monitor = self.graph.add(MonitorNode(episodes, run=self.parameters["simulator"]["run"]))
+        self.tap = self.graph.add(Tap(self.graph.intra_process))
+        run = self.parameters["simulator"]["run"]
+        self.monitor = self.graph.add(MonitorNode(episodes, run=run, intra_process=self.graph.intra_process))
         for name in names:
             self.graph.start(name)
 

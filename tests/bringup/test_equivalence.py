@@ -27,9 +27,9 @@ def rolled_out(stack, episodes, time_limit):
     ]
 
 
-def assert_equal_runs(play_graph, stack, episodes, time_limit):
+def assert_equal_runs(play_graph, stack, episodes, time_limit, **options):
     expected = rolled_out(stack, episodes, time_limit)
-    graph = play_graph(stack, episodes, time_limit=time_limit)
+    graph = play_graph(stack, episodes, time_limit=time_limit, **options)
     graph.finish()
     said, stamp = graph.said, 0
     for instruction, torque, reward, ended in expected:
@@ -41,13 +41,15 @@ def assert_equal_runs(play_graph, stack, episodes, time_limit):
     assert len(said.torque) == len(expected)
 
 
-def test_oracles_do_the_same_in_the_graph_as_in_process(play_graph, oracles):
-    assert_equal_runs(play_graph, oracles, Episodes(2, 3, difficulty=2), 400)
+@pytest.mark.parametrize("handed", [True, False])
+def test_oracles_do_the_same_in_the_graph_as_in_process(play_graph, oracles, handed):
+    assert_equal_runs(play_graph, oracles, Episodes(2, 3, difficulty=2), 400, intra_process=handed)
 
 
-def test_networks_do_the_same_in_the_graph_as_in_process(play_graph, fresh_weights):
+@pytest.mark.parametrize("handed", [True, False])
+def test_networks_do_the_same_in_the_graph_as_in_process(play_graph, fresh_weights, handed):
     stack = Stack(fresh_weights.choices, look_around=10)
-    assert_equal_runs(play_graph, stack, Episodes(2, 5, difficulty=3), 40)
+    assert_equal_runs(play_graph, stack, Episodes(2, 5, difficulty=3), 40, intra_process=handed)
 
 
 @pytest.mark.parametrize("role", ["estimator", "termination", "controller"])

@@ -6,6 +6,7 @@ from mujoban_msgs.msg import Episode
 from rclpy.serialization import serialize_message
 
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.arrivals import Serialised
 from mujoban_msgs_py.runtime.tick_node import PATIENCE, Input, TickNode
 
 
@@ -27,7 +28,7 @@ class Waiting(TickNode):
         header = conversions.header(tick * topics.TICK)
         pose = PoseStamped(header=header)
         for topic, message in ((topics.EPISODE, Episode(header=header, episode=1, step=tick)), (topics.POSE, pose)):
-            self._receive(topic, None, serialize_message(message))
+            self._receive(topic, None, Serialised(serialize_message(message), topic.type))
 
 
 @pytest.fixture
