@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from mujoban_msgs_py.adapted import Adapted, message_of
 from mujoban_msgs_py.conversions import stamp_of
 from mujoban_msgs_py.decoders import Decode
 from mujoban_msgs_py.raw import raw_stamp, read
@@ -34,22 +35,29 @@ class Serialised:
 
 
 class Handed:
-    """A message that a node of the same process has handed over."""
+    """What a node of the same process has handed over."""
 
     raw = b""
 
-    def __init__(self, message: Message) -> None:
-        """Take a message, which all who receive it leave as it is."""
-        self._message = message
-        self._contents: dict[Decode | None, Any] = {None: message}
-        self.stamp = stamp_of(message)
+    def __init__(self, said: Message | Adapted, reader: Decode) -> None:
+        """Take what was said on a topic of a reader; all who receive it leave it as it is."""
+        self._said = said
+        if isinstance(said, Adapted):
+            self.stamp = said.stamp
+            self._contents: dict[Decode | None, Any] = {reader: said.value}
+        else:
+            self.stamp = stamp_of(said)
+            self._contents = {}
 
     def content(self, decode: Decode | None) -> Any:
         """Return what a function makes of the message, as `Serialised` does."""
-        if decode not in self._contents:
-            assert decode is not None
-            self._contents[decode] = decode(self._message)
-        return self._contents[decode]
+        if decode in self._contents:
+            return self._contents[decode]
+        message = message_of(self._said)
+        if decode is None:
+            return message
+        content = self._contents[decode] = decode(message)
+        return content
 
 
 Arrival = Serialised | Handed

@@ -185,15 +185,21 @@ def pose_from_msg(message: PoseStamped) -> NDArray[np.float32]:
 # What the modules say
 
 
-def abstract_state_to_msg(header: Header, state: NDArray[np.float32]) -> AbstractState:
+def abstract_state_to_msg(header: Header, state: NDArray[np.floating[Any]]) -> AbstractState:
     """Return s_abst or an estimate of it, probabilities [rows, columns, 4]."""
-    if state.ndim != 3 or state.shape[2] != len(CHANNELS):
-        raise ConversionError(f"abstract state must be [rows, columns, {len(CHANNELS)}], got {list(state.shape)}")
-    _check_probability("abstract state", state)
     # Shape [4, rows, columns].
-    layers = np.moveaxis(state, 2, 0).astype(np.float32)
+    layers = np.moveaxis(abstract_state_value(state), 2, 0)
     fields = {name: array("f", layer.tobytes()) for name, layer in zip(CHANNELS, layers, strict=True)}
     return AbstractState(header=header, rows=state.shape[0], cols=state.shape[1], **fields)
+
+
+def abstract_state_value(state: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Return a copy of s_abst or of an estimate of it as its message carries it."""
+    if state.ndim != 3 or state.shape[2] != len(CHANNELS):
+        raise ConversionError(f"abstract state must be [rows, columns, {len(CHANNELS)}], got {list(state.shape)}")
+    values = state.astype(np.float32)
+    _check_probability("abstract state", values)
+    return values
 
 
 def abstract_state_from_msg(message: AbstractState, size: int | None = GRID_SIZE) -> NDArray[np.float32]:

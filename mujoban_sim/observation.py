@@ -48,8 +48,8 @@ class ObservationPublisher:
         for topic, publisher in self._publishers.items():
             if topic in self._on_demand and not self._is_wanted(topic, label.stamp):
                 continue
-            composed = self._top_camera(label) if topic is topics.TOP_CAMERA else self._composer.compose(topic, tick)
-            publisher.publish(composed)
+            said = self._top_camera(label) if topic is topics.TOP_CAMERA else self._composer.say(topic, tick)
+            publisher.publish(said)
 
     def _tick(self, label: TickLabel) -> SimulatorTick:
         world = self._world
@@ -60,7 +60,7 @@ class ObservationPublisher:
             spec, int(world.steps[0]), world.reward[0], world.episode_return[0],
             bool(world.solved[0]), bool(world.truncated[0]),
         )  # fmt: skip
-        # Live arrays will do: the messages are composed before the world moves on.
+        # Live arrays will do: what is said of them are copies.
         observation = Observation(world.render(), world.proprio, world.pose)
         truth = GroundTruth(world.abstract_state(), world.pose, world.velocity, world.box_position, world.completed)
         return SimulatorTick(label, progress, observation, truth, 0)

@@ -6,12 +6,14 @@ Nothing here needs rclpy.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
+import numpy as np
 from geometry_msgs.msg import PoseArray
-from mujoban_msgs.msg import AbstractState, Episode, EpisodeTruth, Proprioception, Termination
-from sensor_msgs.msg import CameraInfo, Image
+from mujoban_msgs.msg import Episode, EpisodeTruth, Termination
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from mujoban_core.bodies import Body
@@ -19,6 +21,7 @@ from mujoban_core.camera import camera_intrinsics
 from mujoban_core.grid import BOX, TARGET
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.adapted import Adapted, message_of
 from mujoban_msgs_py.topics import Message, Topic
 from mujoban_sokoban.episodes import EpisodeSpec
 
@@ -70,15 +73,15 @@ class TickComposer:
         self._intrinsics = camera_intrinsics(body.camera)
         self._spec: EpisodeSpec | None = None
         self._level_text = ""
-        self._composers: dict[Topic, Callable[[SimulatorTick], Message]] = {
+        self._composers: dict[Topic, Callable[[SimulatorTick], Message | Adapted]] = {
             topics.CLOCK: lambda tick: conversions.clock_to_msg(tick.label.stamp),
             topics.EPISODE: self._episode,
             topics.CAMERA: self._camera,
             topics.CAMERA_INFO: self._camera_info,
             topics.PROPRIO: self._proprio,
-            topics.POSE: lambda tick: conversions.pose_to_msg(_map(tick), tick.observation.pose[tick.row]),
+            topics.POSE: lambda tick: _pose(tick, tick.observation.pose),
             topics.TRUE_ABSTRACT_STATE: self._abstract_state,
-            topics.TRUE_POSE: lambda tick: conversions.pose_to_msg(_map(tick), tick.truth.pose[tick.row]),
+            topics.TRUE_POSE: lambda tick: _pose(tick, tick.truth.pose),
             topics.TRUE_TWIST: lambda tick: conversions.twist_to_msg(_map(tick), tick.truth.velocity[tick.row]),
             topics.TRUE_BOXES: self._boxes,
             topics.TRUE_TERMINATION: self._termination,
@@ -87,14 +90,18 @@ class TickComposer:
         self.topics = tuple(self._composers)
         """In the order in which the simulator speaks."""
 
-    def compose(self, topic: Topic, tick: SimulatorTick) -> Message:
-        """Return the message of a topic.
+    def say(self, topic: Topic, tick: SimulatorTick) -> Message | Adapted:
+        """Return what is said on a topic: of what every robot perceives, and of the true state, copies of the values.
 
         Raises:
             KeyError: If it is not one of `topics`.
             ConversionError: If the tick holds what the message cannot carry.
         """
         return self._composers[topic](tick)
+
+    def compose(self, topic: Topic, tick: SimulatorTick) -> Message:
+        """Return the message of a topic; it raises what `say` does."""
+        return message_of(self.say(topic, tick))
 
     def _episode(self, tick: SimulatorTick) -> Episode:
         progress = tick.progress
@@ -121,20 +128,24 @@ class TickComposer:
         )
         return conversions.episode_truth_to_msg(_map(tick), reading)
 
-    def _camera(self, tick: SimulatorTick) -> Image:
+    def _camera(self, tick: SimulatorTick) -> Adapted:
         header = _header(tick.label.stamp, topics.CAMERA_FRAME)
-        return conversions.frame_to_msg(header, tick.observation.frame[tick.row])
+        frame = tick.observation.frame[tick.row].copy()
+        return Adapted(tick.label.stamp, frame, partial(conversions.frame_to_msg, header))
 
     def _camera_info(self, tick: SimulatorTick) -> CameraInfo:
         header = _header(tick.label.stamp, topics.CAMERA_FRAME)
         return conversions.camera_info_to_msg(header, self._intrinsics)
 
-    def _proprio(self, tick: SimulatorTick) -> Proprioception:
-        header = _header(tick.label.stamp, topics.BODY_FRAME)
-        return conversions.proprio_to_msg(header, tick.observation.proprio[tick.row], self._joints)
+    def _proprio(self, tick: SimulatorTick) -> Adapted:
+        to_msg = partial(
+            conversions.proprio_to_msg, _header(tick.label.stamp, topics.BODY_FRAME), joints=self._joints
+        )
+        return Adapted(tick.label.stamp, tick.observation.proprio[tick.row].copy(), to_msg)
 
-    def _abstract_state(self, tick: SimulatorTick) -> AbstractState:
-        return conversions.abstract_state_to_msg(_map(tick), tick.truth.abstract_state[tick.row])
+    def _abstract_state(self, tick: SimulatorTick) -> Adapted:
+        to_msg = partial(conversions.abstract_state_to_msg, _map(tick))
+        return Adapted(tick.label.stamp, tick.truth.abstract_state[tick.row].copy(), to_msg)
 
     def _boxes(self, tick: SimulatorTick) -> PoseArray:
         present = tick.truth.box_position[tick.row, : len(tick.progress.spec.level.boxes)]
@@ -143,6 +154,10 @@ class TickComposer:
     def _termination(self, tick: SimulatorTick) -> Termination:
         completed = bool(tick.truth.completed[tick.row])
         return conversions.termination_to_msg(_map(tick), tick.label.sequence, float(completed), completed)
+
+
+def _pose(tick: SimulatorTick, pose: NDArray[np.float32]) -> Adapted:
+    return Adapted(tick.label.stamp, pose[tick.row].copy(), partial(conversions.pose_to_msg, _map(tick)))
 
 
 def _map(tick: SimulatorTick) -> Header:

@@ -11,9 +11,12 @@ from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.timer import Timer
 
+from mujoban_msgs_py.adapted import Adapted, message_of
 from mujoban_msgs_py.arrivals import Handed, Receive
+from mujoban_msgs_py.decoders import DECODERS
 from mujoban_msgs_py.topics import Message, Topic
 
 if TYPE_CHECKING:
@@ -77,9 +80,9 @@ class IntraProcess:
         """Return how many read a topic."""
         return len(self._readers.get(topic, ()))
 
-    def hand_over(self, topic: Topic, message: Message) -> None:
+    def hand_over(self, topic: Topic, said: Message | Adapted) -> None:
         """Deliver a message to all who read its topic; they and the sender leave it as it is."""
-        handed = Handed(message)
+        handed = Handed(said, DECODERS[topic])
         for reader in self._readers.get(topic, ()):
             if len(reader.waiting) < (reader.waiting.maxlen or 0):
                 self._turns.append(reader)  # else the oldest one's turn is the new one's
@@ -111,32 +114,48 @@ class TopicPublisher:
 
     def __init__(self, node: GraphNode, topic: Topic, between: IntraProcess | None) -> None:
         """Publish on behalf of a node, within the process by `between`, if there is one."""
-        self._publisher = node.create_publisher(topic.type, topic.name, topic.qos)
-        self._topic, self._between = topic, between
-        self._unsaid: Message | None = None
+        self._node, self._topic, self._between = node, topic, between
+        self._publisher = self._open()
+        self._unsaid: Message | Adapted | None = None
         """Latest message of a latched topic, if the middleware has not got it."""
+        self._has_sent = False
         if between is not None and topic.latched:
-            node.create_timer(LATE_JOINER_PERIOD, self._say_to_late_joiners)
+            node.create_timer(LATE_JOINER_PERIOD, self._mind_late_joiners)
+
+    def _open(self) -> Publisher:
+        return self._node.create_publisher(self._topic.type, self._topic.name, self._topic.qos)
 
     @property
     def subscriptions(self) -> int:
         """How many read the topic, in this process and in others."""
         return self._publisher.get_subscription_count()
 
-    def publish(self, message: Message | bytes) -> None:
+    def publish(self, said: Message | Adapted | bytes) -> None:
         """Publish a message; bytes are one that is serialised already."""
-        if self._between is None or isinstance(message, bytes) or self._is_heard_outside():
-            self._unsaid = None
-            self._publisher.publish(message)
-            return
-        self._between.hand_over(self._topic, message)
-        if self._topic.latched:
-            self._unsaid = message
+        if isinstance(said, bytes):
+            self._send(said)
+        elif self._between is None or self._is_heard_outside():
+            self._send(message_of(said))
+        else:
+            self._between.hand_over(self._topic, said)
+            if self._topic.latched:
+                self._unsaid = said
+
+    def _send(self, message: Message | bytes) -> None:
+        self._unsaid, self._has_sent = None, True
+        self._publisher.publish(message)
 
     def _is_heard_outside(self) -> bool:
         assert self._between is not None
         return self._publisher.get_subscription_count() > self._between.readers(self._topic)
 
-    def _say_to_late_joiners(self) -> None:
-        if self._unsaid is not None and self._is_heard_outside():
+    def _mind_late_joiners(self) -> None:
+        """Say the latest message to who has come, and see to it that whoever comes does not hear an older one first."""
+        if self._unsaid is None:
+            return
+        if self._is_heard_outside():
             self.publish(self._unsaid)
+        elif self._has_sent:
+            # What the middleware keeps is out of date; it forgets it with the publisher.
+            self._node.destroy_publisher(self._publisher)
+            self._publisher, self._has_sent = self._open(), False

@@ -20,6 +20,7 @@ from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
 from mujoban_core.plugins import LEARNED, PRIVILEGED, check_body, check_told, chosen_weights, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.adapted import message_of
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS, Condition
 from mujoban_msgs_py.runtime.kept import KeptArrays, leaves, with_leaves
@@ -152,7 +153,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
             return
         arrays: dict[str, Any] = {f"{_LEAF}{i}": leaf for i, leaf in enumerate(leaves(self.state))}
         arrays[_PLACE] = np.array([self._episode, stamp])
-        arrays[_ANSWER] = np.frombuffer(b"".join(serialize_message(o.message) for o in outputs), np.uint8)
+        arrays[_ANSWER] = np.frombuffer(b"".join(_serialised(output) for output in outputs), np.uint8)
         self._kept.write(arrays, self)
 
     def _resume(self, arrays: dict[str, NDArray[Any]]) -> None:
@@ -210,3 +211,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         self.counts["reloads"] += 1
         self.get_logger().info(f"loaded {weights or 'the weights that ship'} on {device}")
         return SetParametersResult(successful=True)
+
+
+def _serialised(output: Output) -> bytes:
+    said = output.message
+    return said if isinstance(said, bytes) else serialize_message(message_of(said))

@@ -30,6 +30,7 @@ from rclpy.task import Future
 
 from mujoban_core.children import end_with_parent
 from mujoban_core.signals import StopSignal, interruptible
+from mujoban_msgs_py.adapted import Adapted
 from mujoban_msgs_py.arrivals import Arrival
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import belongs, reject, subscribe
@@ -63,7 +64,7 @@ class Output(NamedTuple):
     """A message to publish."""
 
     publisher: TopicPublisher
-    message: Message | bytes
+    message: Message | Adapted | bytes
     """Bytes are one that is serialised already."""
 
 

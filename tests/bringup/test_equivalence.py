@@ -1,11 +1,17 @@
 """The lockstep graph and the rollout in process are one policy: same instructions, torques and rewards, exactly."""
 
+from collections import defaultdict
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
+from rclpy.node import Node
 
 from bringup.command import Choice, Stack
 from bringup.rollout import ticks
+from mujoban_msgs_py import topics
+from mujoban_msgs_py.conversions import stamp_of
 from mujoban_msgs_py.topics import TICK
 from mujoban_planner.deliberation import Deliberation
 from mujoban_sim.world import World
@@ -50,6 +56,27 @@ def test_oracles_do_the_same_in_the_graph_as_in_process(play_graph, oracles, han
 def test_networks_do_the_same_in_the_graph_as_in_process(play_graph, fresh_weights, handed):
     stack = Stack(fresh_weights.choices, look_around=10)
     assert_equal_runs(play_graph, stack, Episodes(2, 5, difficulty=3), 40, intra_process=handed)
+
+
+def test_who_listens_for_a_while_from_outside_hears_all_of_it_and_changes_nothing(play_graph, fresh_weights):
+    stack, episodes = Stack(fresh_weights.choices, look_around=5), Episodes(1, 9, difficulty=2)
+    heard = defaultdict(list)
+    undisturbed = play_graph(stack, episodes, time_limit=60)
+    undisturbed.finish()
+    undisturbed.__exit__(None, None, None)
+    graph = play_graph(stack, episodes, time_limit=60)
+    graph.spin_until(lambda: len(graph.said.torque) >= 10)
+    stranger = graph.graph.add(Node("stranger"))
+    for topic in topics.MODULE_TOPICS:
+        note = partial(lambda name, message: heard[name].append(stamp_of(message) // TICK), topic.name)
+        stranger.create_subscription(topic.type, topic.name, note, topic.qos)
+    graph.spin_until(lambda: len(graph.said.torque) >= 40)
+    graph.graph.end(stranger)
+    graph.finish()
+    assert (graph.said.instruction, graph.said.torque) == (undisturbed.said.instruction, undisturbed.said.torque)
+    assert graph.said.estimate == undisturbed.said.estimate and graph.said.reward == undisturbed.said.reward
+    for name in (topic.name for topic in topics.MODULE_TOPICS):
+        assert heard[name] == [*range(heard[name][0], heard[name][-1] + 1)] and heard[name][-1] - heard[name][0] > 20
 
 
 @pytest.mark.parametrize("role", ["estimator", "termination", "controller"])

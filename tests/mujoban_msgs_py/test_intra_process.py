@@ -12,7 +12,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.arrivals import Handed
 from mujoban_msgs_py.listening import listen, subscribe
 from mujoban_msgs_py.runtime.graph_node import GraphNode
-from mujoban_msgs_py.runtime.intra_process import IntraProcess
+from mujoban_msgs_py.runtime.intra_process import LATE_JOINER_PERIOD, IntraProcess
 from mujoban_msgs_py.runtime.tick_node import live_qos
 
 
@@ -48,6 +48,11 @@ class Company:
         node = self.node(name)
         subscribe(node, topic, arrivals.append, qos)
         return node, arrivals
+
+    def spin_for(self, seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.02)
 
     def spin_until(self, condition):
         deadline = time.monotonic() + 20
@@ -103,14 +108,23 @@ def test_as_soon_as_somebody_else_reads_all_receive_what_is_sent_once(company):
 
 def test_who_joins_late_hears_the_latest_message_of_a_latched_topic(company):
     said, (_, inside) = company.node("said"), company.reader("inside", topics.INSTRUCTION)
-    output, late = said.create_output(topics.INSTRUCTION), []
-    for sequence in (1, 2):
+    output = said.create_output(topics.INSTRUCTION)
+
+    def say(sequence):
         output.publish(conversions.instruction_to_msg(conversions.header(sequence * topics.TICK), sequence, 3))
-    company.spin_until(lambda: len(inside) == 2)
-    stranger = company.add(Node("stranger"))
-    stranger.create_subscription(Instruction, topics.INSTRUCTION.name, late.append, topics.INSTRUCTION.qos)
-    company.spin_until(lambda: late)
-    assert [message.sequence for message in late] == [2]
+
+    for latest in (2, 4):  # what a stranger has heard before is kept for nobody
+        say(latest - 1)
+        say(latest)
+        company.spin_until(lambda latest=latest: len(inside) >= latest)
+        company.spin_for(3 * LATE_JOINER_PERIOD)
+        late: list[Instruction] = []
+        stranger = company.add(Node(f"stranger_{latest}"))
+        stranger.create_subscription(Instruction, topics.INSTRUCTION.name, late.append, topics.INSTRUCTION.qos)
+        company.spin_until(lambda late=late: late)
+        assert [message.sequence for message in late] == [latest]
+        company.remove(stranger)
+        company.spin_until(lambda: output.subscriptions <= 1)
 
 
 def test_a_reader_that_is_too_slow_loses_the_oldest_and_nobody_else_does(company):

@@ -1,0 +1,56 @@
+"""What the simulator hands over is what the readers of its messages make of them."""
+
+import numpy as np
+import pytest
+
+from mujoban_core.bodies import get_body
+from mujoban_core.interfaces import GroundTruth, Observation
+from mujoban_msgs_py.adapted import Adapted
+from mujoban_msgs_py.decoders import DECODERS
+from mujoban_sim.tick_messages import EpisodeProgress, SimulatorTick, TickComposer, TickLabel
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
+
+
+@pytest.fixture(scope="module", params=["ball", "ant"])
+def played(request):
+    """Return the composer of a body, and some ticks of a robot that drives about."""
+    episodes, rng = Episodes(1, 3, difficulty=3), np.random.default_rng(0)
+    world = World(1, body=request.param, max_boxes=episodes.max_boxes)
+    world.reset([0], [episodes[0]])
+    ticks = []
+    for step in range(1, 60):
+        world.step(rng.uniform(-1, 1, (1, world.body.action_size)).astype(np.float32))
+        observation = Observation(world.render().copy(), world.proprio.copy(), world.pose.copy())
+        truth = GroundTruth(
+            world.abstract_state().copy(), world.pose.copy(), world.velocity.copy(), world.box_position.copy(),
+            world.completed.copy(),
+        )  # fmt: skip
+        progress = EpisodeProgress(episodes[0], step, 0.0, 0.0, False, False)
+        ticks.append(SimulatorTick(TickLabel(step * 50_000_000, 1, 3, 0), progress, observation, truth, 0))
+    world.close()
+    return TickComposer(get_body(request.param)), ticks
+
+
+def test_a_value_that_is_handed_over_is_to_the_bit_what_its_message_says(played):
+    composer, ticks = played
+    adapted = set()
+    for tick in ticks:
+        for topic in composer.topics:
+            said = composer.say(topic, tick)
+            if isinstance(said, Adapted):
+                adapted.add(topic.name)
+                read = DECODERS[topic](composer.compose(topic, tick))
+                assert (read.dtype, read.shape) == (said.value.dtype, said.value.shape)
+                assert read.tobytes() == said.value.tobytes(), topic.name
+                assert said.stamp == tick.label.stamp
+    assert {"/camera/image_raw", "/proprio", "/pose", "/ground_truth/abstract_state"} <= adapted
+
+
+def test_a_value_that_is_handed_over_does_not_change_with_the_world(played):
+    composer, ticks = played
+    for topic in composer.topics:
+        said = composer.say(topic, ticks[0])
+        if isinstance(said, Adapted):
+            arrays = (*ticks[0].observation, *ticks[0].truth)
+            assert not any(np.shares_memory(said.value, array) for array in arrays), topic.name
