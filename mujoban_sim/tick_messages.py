@@ -141,11 +141,11 @@ class TickComposer:
         to_msg = partial(
             conversions.proprio_to_msg, _header(tick.label.stamp, topics.BODY_FRAME), joints=self._joints
         )
-        return Adapted(tick.label.stamp, tick.observation.proprio[tick.row].copy(), to_msg)
+        return Adapted(tick.label.stamp, _finite("proprio", tick.observation.proprio[tick.row]), to_msg)
 
     def _abstract_state(self, tick: SimulatorTick) -> Adapted:
         to_msg = partial(conversions.abstract_state_to_msg, _map(tick))
-        return Adapted(tick.label.stamp, tick.truth.abstract_state[tick.row].copy(), to_msg)
+        return Adapted(tick.label.stamp, conversions.abstract_state_value(tick.truth.abstract_state[tick.row]), to_msg)
 
     def _boxes(self, tick: SimulatorTick) -> PoseArray:
         present = tick.truth.box_position[tick.row, : len(tick.progress.spec.level.boxes)]
@@ -157,7 +157,14 @@ class TickComposer:
 
 
 def _pose(tick: SimulatorTick, pose: NDArray[np.float32]) -> Adapted:
-    return Adapted(tick.label.stamp, pose[tick.row].copy(), partial(conversions.pose_to_msg, _map(tick)))
+    return Adapted(tick.label.stamp, _finite("pose", pose[tick.row]), partial(conversions.pose_to_msg, _map(tick)))
+
+
+def _finite(what: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a copy of values of which none is NaN or infinite."""
+    if not np.isfinite(values).all():
+        raise conversions.ConversionError(f"{what} must be finite, got {values.tolist()}")
+    return values.copy()
 
 
 def _map(tick: SimulatorTick) -> Header:

@@ -6,7 +6,9 @@ import pytest
 from mujoban_core.bodies import get_body
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py.adapted import Adapted
+from mujoban_msgs_py.conversions import ConversionError
 from mujoban_msgs_py.decoders import DECODERS
+from mujoban_msgs_py.topics import POSE, PROPRIO
 from mujoban_sim.tick_messages import EpisodeProgress, SimulatorTick, TickComposer, TickLabel
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
@@ -54,3 +56,13 @@ def test_a_value_that_is_handed_over_does_not_change_with_the_world(played):
         if isinstance(said, Adapted):
             arrays = (*ticks[0].observation, *ticks[0].truth)
             assert not any(np.shares_memory(said.value, array) for array in arrays), topic.name
+
+
+@pytest.mark.parametrize("where", ["proprio", "pose"])
+def test_a_robot_that_is_nowhere_is_not_said_to_be_anywhere(played, where):
+    composer, (tick, *_) = played
+    astray = getattr(tick.observation, where).copy()
+    astray[0, 0] = np.nan
+    tick = tick._replace(observation=tick.observation._replace(**{where: astray}))
+    with pytest.raises(ConversionError, match=f"{where} must be finite"):
+        composer.say(PROPRIO if where == "proprio" else POSE, tick)
