@@ -105,13 +105,15 @@ def check_file(option: str, path: Path | None) -> None:
         path: The file; None: there is none to check.
 
     Raises:
-        ValueError: If it is a folder, or there is no folder for it.
+        ValueError: If it is a folder, there is none for it, or it is the record of weights, which are none without it.
         OSError: If it may not be written.
     """
     if path is None or is_device(path):
         return
     if path.is_dir():
         raise ValueError(f"{option} {path}: is a folder, expected the name of a file")
+    if path.suffix == ".json" and path.is_file() and (weights := path.with_suffix(".safetensors")).is_file():
+        raise ValueError(f"{option} {path}: is the record of {weights.name} beside it, expected another name")
     folder = path.resolve().parent
     if not folder.is_dir():
         raise ValueError(f"{option} {path}: no such folder {folder}, expected one that exists")

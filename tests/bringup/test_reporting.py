@@ -101,6 +101,15 @@ def test_places_for_output_are_checked_before_anything_is_played(capfd, monkeypa
     assert f"error: {options[0]} {options[1]}: " in err and why in err and "\n" not in err
 
 
+def test_a_report_does_not_take_the_place_of_the_record_of_weights(capfd, monkeypatch, tmp_path):
+    monkeypatch.setattr("bringup.evaluate.evaluate", lambda *args, **options: pytest.fail("went on"))
+    record, weights = tmp_path / "mine.json", tmp_path / "mine.safetensors"
+    record.write_text("{}")
+    weights.touch()
+    assert run(evaluate, "--json", record) == 2 and record.read_text() == "{}"
+    assert "is the record of mine.safetensors beside it, expected another name" in capfd.readouterr().err
+
+
 def test_seeds_of_two_ranges_are_refused_before_anything_is_played(capfd, monkeypatch, tmp_path):
     for name in ("bringup.evaluate.evaluate", "bringup.stack.play"):
         monkeypatch.setattr(name, lambda *args, **options: pytest.fail("went on"))
