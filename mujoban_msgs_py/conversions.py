@@ -101,7 +101,7 @@ def frame_from_msg(message: Image, size: int | None = FRAME_SIZE) -> NDArray[np.
 
 def camera_info_to_msg(header: Header, intrinsics: ArrayLike, size: int = FRAME_SIZE) -> CameraInfo:
     """Return the calibration of a square pinhole camera with intrinsic matrix K, [3, 3]."""
-    k = _finite("intrinsics", intrinsics, (3, 3), np.float64)
+    k = finite("intrinsics", intrinsics, (3, 3), np.float64)
     projection = np.hstack([k, np.zeros((3, 1))])
     return CameraInfo(
         header=header,
@@ -117,13 +117,13 @@ def camera_info_to_msg(header: Header, intrinsics: ArrayLike, size: int = FRAME_
 
 def camera_info_from_msg(message: CameraInfo) -> NDArray[np.float64]:
     """Return the intrinsic matrix K, [3, 3]."""
-    return _finite("k", message.k, (9,), np.float64).reshape(3, 3)
+    return finite("k", message.k, (9,), np.float64).reshape(3, 3)
 
 
 def proprio_to_msg(header: Header, proprio: ArrayLike, joints: Sequence[str]) -> Proprioception:
     """Return o_pr, [P], in the layout of `mujoban_core.bodies.ProprioSlices`, of a body with these joints."""
     part = ProprioSlices.of(len(joints))
-    values = _finite("proprio", proprio, (part.size,), np.float64).tolist()
+    values = finite("proprio", proprio, (part.size,), np.float64).tolist()
     message = Proprioception(
         header=header,
         name=list(joints),
@@ -148,7 +148,7 @@ def proprio_from_msg(message: Proprioception) -> NDArray[np.float32]:
     values = [c for field in _INERTIAL for v in (getattr(message, field),) for c in (v.x, v.y, v.z)]
     axis = message.world_z_axis
     values += [*message.position, *message.velocity, axis.x, axis.y, axis.z]
-    return _finite("proprioception", values, (ProprioSlices.of(count).size,), np.float32)
+    return finite("proprioception", values, (ProprioSlices.of(count).size,), np.float32)
 
 
 def body_proprio_from_msg(message: Proprioception) -> NDArray[np.float32]:
@@ -161,7 +161,7 @@ def body_proprio_from_msg(message: Proprioception) -> NDArray[np.float32]:
 
 def pose_to_msg(header: Header, pose: ArrayLike) -> PoseStamped:
     """Return a pose (x [m], y [m], psi [rad]), [3]; psi in [-pi, pi]."""
-    x, y, yaw = _finite("pose", pose, (3,), np.float64).tolist()
+    x, y, yaw = finite("pose", pose, (3,), np.float64).tolist()
     message = PoseStamped(header=header)
     p, q = message.pose.position, message.pose.orientation
     p.x, p.y, q.z, q.w = x, y, math.sin(yaw / 2), math.cos(yaw / 2)
@@ -179,7 +179,7 @@ def pose_from_msg(message: PoseStamped) -> NDArray[np.float32]:
         yaw = 2 * half
     else:
         yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
-    return _finite("pose", (p.x, p.y, yaw), (3,), np.float32)
+    return finite("pose", (p.x, p.y, yaw), (3,), np.float32)
 
 
 # What the modules say
@@ -197,9 +197,8 @@ def abstract_state_value(state: NDArray[np.floating[Any]]) -> NDArray[np.float32
     """Return a copy of s_abst or of an estimate of it as its message carries it."""
     if state.ndim != 3 or state.shape[2] != len(CHANNELS):
         raise ConversionError(f"abstract state must be [rows, columns, {len(CHANNELS)}], got {list(state.shape)}")
-    values = state.astype(np.float32)
-    _check_probability("abstract state", values)
-    return values
+    _check_probability("abstract state", state)
+    return state.astype(np.float32)
 
 
 def abstract_state_from_msg(message: AbstractState, size: int | None = GRID_SIZE) -> NDArray[np.float32]:
@@ -250,7 +249,7 @@ def termination_to_msg(
     return Termination(
         header=header,
         sequence=int(sequence),
-        probability=_probability(np.float32(probability)),
+        probability=float(np.float32(_probability(probability))),
         terminated=bool(terminated),
         timed_out=bool(timed_out),
     )
@@ -278,7 +277,7 @@ def torque_from_msg(message: JointState, size: int | None = None) -> NDArray[np.
 
 def twist_to_msg(header: Header, velocity: ArrayLike) -> TwistStamped:
     """Return (vx [m/s], vy [m/s], yaw rate [rad/s]) in the map frame, [3]."""
-    vx, vy, rate = _finite("velocity", velocity, (3,), np.float64).tolist()
+    vx, vy, rate = finite("velocity", velocity, (3,), np.float64).tolist()
     message = TwistStamped(header=header)
     message.twist.linear.x, message.twist.linear.y, message.twist.angular.z = vx, vy, rate
     return message
@@ -287,19 +286,19 @@ def twist_to_msg(header: Header, velocity: ArrayLike) -> TwistStamped:
 def twist_from_msg(message: TwistStamped) -> NDArray[np.float32]:
     """Return (vx [m/s], vy [m/s], yaw rate [rad/s]) in the map frame, [3]."""
     linear, angular = message.twist.linear, message.twist.angular
-    return _finite("velocity", (linear.x, linear.y, angular.z), (3,), np.float32)
+    return finite("velocity", (linear.x, linear.y, angular.z), (3,), np.float32)
 
 
 def boxes_to_msg(header: Header, position: ArrayLike) -> PoseArray:
     """Return o_box, box centres in the map frame [m], [K, 2]; boxes never turn."""
-    centres = _finite("box positions", position, (None, 2), np.float64).tolist()
+    centres = finite("box positions", position, (None, 2), np.float64).tolist()
     return PoseArray(header=header, poses=[Pose(position=Point(x=x, y=y)) for x, y in centres])
 
 
 def boxes_from_msg(message: PoseArray) -> NDArray[np.float32]:
     """Return o_box, box centres in the map frame [m], [K, 2]."""
     centres = np.array([(p.position.x, p.position.y) for p in message.poses], np.float64).reshape(-1, 2)
-    return _finite("box positions", centres, (None, 2), np.float32)
+    return finite("box positions", centres, (None, 2), np.float32)
 
 
 class EpisodeReading(NamedTuple):
@@ -338,7 +337,7 @@ class EpisodeTruthReading(NamedTuple):
 
 def episode_truth_to_msg(header: Header, reading: EpisodeTruthReading) -> EpisodeTruth:
     """Return the truth about an episode."""
-    reward, total = _finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float32).tolist()
+    reward, total = finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float32).tolist()
     return EpisodeTruth(
         header=header,
         episode=int(reading.episode),
@@ -358,7 +357,7 @@ def episode_truth_to_msg(header: Header, reading: EpisodeTruthReading) -> Episod
 def episode_truth_from_msg(message: EpisodeTruth) -> EpisodeTruthReading:
     """Return the truth about an episode."""
     reading = EpisodeTruthReading(*(getattr(message, name) for name in EpisodeTruthReading._fields))
-    _finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float64)
+    finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float64)
     if reading.difficulty not in (0, *DIFFICULTIES):
         raise ConversionError(f"difficulty must be 0 or one of {sorted(DIFFICULTIES)}, got {reading.difficulty}")
     return reading
@@ -367,7 +366,7 @@ def episode_truth_from_msg(message: EpisodeTruth) -> EpisodeTruthReading:
 # Checks
 
 
-def _finite(what: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
+def finite(what: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
     """Return values as an array after a check of shape (None: any length) and finiteness."""
     result = np.asarray(values, np.float64)
     if len(result.shape) != len(shape) or any(
@@ -382,19 +381,19 @@ def _finite(what: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: 
 
 
 def _torque(values: ArrayLike, size: int | None) -> NDArray[np.float32]:
-    torque = _finite("torque", values, (size,), np.float32)
+    torque = finite("torque", values, (size,), np.float32)
     if torque.size and np.abs(torque).max() > 1.0:
         raise ConversionError(f"torque must lie in [-1, 1], got {torque.tolist()}")
     return torque
 
 
-def _check_probability(what: str, values: NDArray[np.float32]) -> None:
+def _check_probability(what: str, values: NDArray[np.floating[Any]]) -> None:
     # Written so that NaN fails as well.
     if values.size and not (values.min() >= 0.0 and values.max() <= 1.0):
         raise ConversionError(f"{what} must hold probabilities in [0, 1], got {values.min()} to {values.max()}")
 
 
-def _probability(value: float | np.float32) -> float:
+def _probability(value: float) -> float:
     if not 0.0 <= (probability := float(value)) <= 1.0:
         raise ConversionError(f"probability must lie in [0, 1], got {probability}")
     return probability

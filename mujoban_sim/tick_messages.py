@@ -141,7 +141,8 @@ class TickComposer:
         to_msg = partial(
             conversions.proprio_to_msg, _header(tick.label.stamp, topics.BODY_FRAME), joints=self._joints
         )
-        return Adapted(tick.label.stamp, _finite("proprio", tick.observation.proprio[tick.row]), to_msg)
+        proprio = conversions.finite("proprio", tick.observation.proprio[tick.row], (None,), np.float32)
+        return Adapted(tick.label.stamp, proprio, to_msg)
 
     def _abstract_state(self, tick: SimulatorTick) -> Adapted:
         to_msg = partial(conversions.abstract_state_to_msg, _map(tick))
@@ -157,14 +158,8 @@ class TickComposer:
 
 
 def _pose(tick: SimulatorTick, pose: NDArray[np.float32]) -> Adapted:
-    return Adapted(tick.label.stamp, _finite("pose", pose[tick.row]), partial(conversions.pose_to_msg, _map(tick)))
-
-
-def _finite(what: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a copy of values of which none is NaN or infinite."""
-    if not np.isfinite(values).all():
-        raise conversions.ConversionError(f"{what} must be finite, got {values.tolist()}")
-    return values.copy()
+    value = conversions.finite("pose", pose[tick.row], (3,), np.float32)
+    return Adapted(tick.label.stamp, value, partial(conversions.pose_to_msg, _map(tick)))
 
 
 def _map(tick: SimulatorTick) -> Header:

@@ -2,6 +2,7 @@
 
 import time
 
+import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
 from mujoban_msgs.msg import Instruction
@@ -187,7 +188,13 @@ def test_a_message_of_a_value_that_its_topic_does_not_carry_is_rejected(company)
 
 @pytest.mark.parametrize("value", [0.1, 1 / 3])
 def test_numbers_are_rounded_where_a_message_is_made_as_they_are_where_it_is_sent(value):
-    import numpy as np
-
     said = conversions.termination_to_msg(conversions.header(0), 1, value, False).probability
     assert said == float(np.float32(value)) != value
+
+
+def test_a_probability_above_one_by_less_than_rounding_is_refused():
+    header, above = conversions.header(0), 1.0 + 1e-9
+    with pytest.raises(conversions.ConversionError):
+        conversions.termination_to_msg(header, 1, above, False)
+    with pytest.raises(conversions.ConversionError):
+        conversions.abstract_state_to_msg(header, np.full((10, 10, 4), above))
