@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sim.presets import DEFAULT_WORLD, EASED
 from mujoban_sim.scene import SceneCache
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
@@ -69,11 +69,12 @@ def run(seconds: float = 0.25, rounds: int = 20) -> dict[str, float]:
         rounds: how often each one is measured.
 
     Returns:
-        Rates per second and their ratio to MuJoCo's default renderer (medians over the rounds), and the machine's load
-        before (1 minute mean of waiting and running processes).
+        Rates per second and their ratios to those of MuJoCo's default renderer and of the eased world, whose drawn
+        walls are half as high (medians over the rounds), and the machine's load before (1 minute mean of waiting and
+        running processes).
     """
     load = os.getloadavg()[0]
-    one, two = _make_world(1), _make_world(THREADS)
+    one, two, low = _make_world(1), _make_world(THREADS), _make_world(1, EASED.name)
     rng = np.random.default_rng(0)
 
     def step() -> int:
@@ -83,6 +84,7 @@ def run(seconds: float = 0.25, rounds: int = 20) -> dict[str, float]:
     contestants: dict[str, Callable[[], int]] = {
         "default_renderer_frames_per_second": _default_renderer(one),
         "frames_per_second": lambda: len(one.render()),
+        "frames_per_second_low_walls": lambda: len(low.render()),
         "frames_per_second_2_threads": lambda: len(two.render()),
         "steps_with_camera_per_second_2_threads": step,
     }
@@ -93,12 +95,12 @@ def run(seconds: float = 0.25, rounds: int = 20) -> dict[str, float]:
     result = {name: statistics.median(values) for name, values in rates.items()}
     start, count = time.process_time(), _rate(contestants["frames_per_second"], seconds) * seconds
     result["frames_per_cpu_second"] = count / (time.process_time() - start)
-    result["frames_ratio_to_default"] = statistics.median(
-        ours / theirs
-        for ours, theirs in zip(rates["frames_per_second"], rates["default_renderer_frames_per_second"], strict=True)
-    )
-    one.close()
-    two.close()
+    others = {"default": "default_renderer_frames_per_second", "low_walls": "frames_per_second_low_walls"}
+    for name, other in others.items():
+        pairs = zip(rates["frames_per_second"], rates[other], strict=True)
+        result[f"frames_ratio_to_{name}"] = statistics.median(ours / theirs for ours, theirs in pairs)
+    for world in (one, two, low):
+        world.close()
     return {**result, "load": load}
 
 
