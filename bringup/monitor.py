@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any, Final, NamedTuple, Unpack
 
 import numpy as np
-from mujoban_msgs.msg import EpisodeTruth
 from numpy.typing import NDArray
 from rclpy.task import Future
 
@@ -17,7 +16,7 @@ from bringup.results import EpisodeResult
 from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.plugins import AGENT
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.decoders import checked
+from mujoban_msgs_py.conversions import EpisodeTruthReading
 from mujoban_msgs_py.listening import PublisherWatch, Received, listen, refuse_run
 from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
@@ -101,7 +100,9 @@ class MonitorNode(GraphNode):
         """
         super().__init__("monitor", **options)
         self.run = run
-        self.episode: EpisodeTruth | None = None
+        self.episode: EpisodeTruthReading | None = None
+        self.stamp = 0
+        """Simulated time of the latest message about the episode [ns]."""
         self.latest: Watched | None = None
         self.results: list[EpisodeResult] = []
         self.finished = Future()
@@ -116,23 +117,18 @@ class MonitorNode(GraphNode):
         self._first = 0
         """Stamp of the first tick of the episode that was heard [ns]."""
         self._joined = -1
-        self._end: EpisodeTruth | None = None
-        self._doubted: EpisodeTruth | None = None
+        self._end: Received | None = None
+        self._doubted: Received | None = None
         self._doubted_at = 0
         self._heard = time.monotonic()
         self.create_timer(_PATIENCE / 10, self._end_in_silence)
         qos = live_qos(depth=1024)
-        listen(self, topics.TRUE_EPISODE, self._on_episode, qos=qos, decode=checked(topics.TRUE_EPISODE))
+        listen(self, topics.TRUE_EPISODE, self._on_episode, qos=qos)
         for topic in watched:
             steady = topic == topics.TRUE_ABSTRACT_STATE
             listen(self, topic, partial(self._receive, topic.name), qos=qos, steady=steady)
         self._acknowledge = self.create_output(topics.MONITORED)
         self.watch = PublisherWatch(self, topics.PUBLISHERS | ({topics.TORQUE.name: AGENT} if alone else {}))
-
-    @property
-    def stamp(self) -> int:
-        """Simulated time of the latest message about the episode [ns]."""
-        return 0 if self.episode is None else conversions.stamp_of(self.episode)
 
     @property
     def ticks_per_second(self) -> float:
@@ -149,30 +145,30 @@ class MonitorNode(GraphNode):
             self._on_tick(Watched(joined))
 
     def _on_episode(self, received: Received) -> None:
-        message: EpisodeTruth = received.content
-        if message.seed not in self._episodes.seeds or message.difficulty != self._episodes.difficulty:
-            refuse_run(self, f"it plays seed {message.seed} at difficulty {message.difficulty}")
+        said: EpisodeTruthReading = received.content
+        if said.seed not in self._episodes.seeds or said.difficulty != self._episodes.difficulty:
+            refuse_run(self, f"it plays seed {said.seed} at difficulty {said.difficulty}")
             return
         self._heard = time.monotonic()
-        if self._end is not None and message.episode == self._end.episode:
+        if self._end is not None and said.episode == self._end.content.episode:
             # The episode goes on, so that its end was not the simulator's word; or a stranger says that it does.
-            if message.header.stamp != self._end.header.stamp:
+            if received.stamp != self._end.stamp:
                 self._doubted, self._end, self._doubted_at = self._end, None, self.ticks
                 self.counts["contradictory episodes"] += 1
-        elif self._end is not None or (self._doubted is not None and message.episode != self._doubted.episode):
+        elif self._end is not None or (self._doubted is not None and said.episode != self._doubted.content.episode):
             self._finish()
         self._started = self._started or time.perf_counter()
-        if self.episode is None or message.episode != self.episode.episode:
-            self._log, self._sequence = EpisodeLog(message.seed), 0
-            self._first = conversions.stamp_of(message)
-        elif message.header.stamp == self.episode.header.stamp:
+        if self.episode is None or said.episode != self.episode.episode:
+            self._log, self._sequence = EpisodeLog(said.seed), 0
+            self._first = received.stamp
+        elif received.stamp == self.stamp:
             self._confirm()  # the simulator offers the tick again
             return
-        self.episode = message
+        self.episode, self.stamp = said, received.stamp
         if self._joined > self.stamp + _AHEAD:  # what was joined was of no tick of the simulator's
             self._joined = -1
-        if message.terminated or message.truncated:
-            self._end = message
+        if said.terminated or said.truncated:
+            self._end = received
             self._finish_when_joined()
         self._confirm()
 
@@ -198,7 +194,7 @@ class MonitorNode(GraphNode):
 
     def _finish_when_joined(self) -> None:
         """End the episode when the tick before its last has been noted."""
-        if self._end is not None and self._joined >= conversions.stamp_of(self._end) - topics.TICK:
+        if self._end is not None and self._joined >= self._end.stamp - topics.TICK:
             self._finish()
 
     def _end_in_silence(self) -> None:
@@ -217,8 +213,9 @@ class MonitorNode(GraphNode):
         self._ended = time.perf_counter()
         # In real time, or of a stranger, an end may be heard before any tick.
         last = np.zeros((GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.float32) if self.latest is None else self.latest.truth
+        truth: EpisodeTruthReading = end.content
         self.results.append(
-            self._log.result(solved=end.solved, steps=end.step, episode_return=end.episode_return, last=last)
+            self._log.result(solved=truth.solved, steps=truth.step, episode_return=truth.episode_return, last=last)
         )
         if len(self.results) == len(self._episodes):
             self.finished.set_result(None)

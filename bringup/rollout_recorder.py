@@ -161,11 +161,13 @@ def _decided(row: _Row, tick: Tick, m: int) -> dict[Topic, Message]:
     said = tick.decision
     beta = said.termination
     header = conversions.header(row.stamp, topics.MAP_FRAME)
+    termination = conversions.termination_value(
+        row.sequence, beta.probability[m], beta.terminated[m], beta.timed_out[m]
+    )
+    instruction = conversions.instruction_value(said.sequence[m], said.instruction[m])
     return {
         topics.ABSTRACT_STATE: conversions.abstract_state_to_msg(header, said.abstract_state[m]),
-        topics.TERMINATION: conversions.termination_to_msg(
-            header, row.sequence, beta.probability[m], beta.terminated[m], beta.timed_out[m]
-        ),
-        topics.INSTRUCTION: conversions.instruction_to_msg(header, said.sequence[m], said.instruction[m]),
+        topics.TERMINATION: conversions.termination_to_msg(header, termination),
+        topics.INSTRUCTION: conversions.instruction_to_msg(header, instruction),
         topics.TORQUE: conversions.torque_to_msg(header, said.torque[m]),
     }

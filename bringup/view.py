@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from typing import Final
 
 import numpy as np
-from mujoban_msgs.msg import EpisodeTruth
 from numpy.typing import NDArray
 from rich import box
 from rich.columns import Columns
@@ -21,7 +20,7 @@ from bringup.monitor import MonitorNode, Watched
 from bringup.results import EpisodeResult
 from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, TARGET, WALL, Instruction
 from mujoban_core.plugins import privileged_roles
-from mujoban_msgs_py.conversions import InstructionReading
+from mujoban_msgs_py.conversions import EpisodeTruthReading, InstructionReading
 
 ARROWS = {
     Instruction.STAY: "●",
@@ -63,7 +62,7 @@ def _glyph(cell: NDArray[np.float32], agent: bool) -> tuple[str, str]:
 
 
 def live_view(
-    episode: EpisodeTruth | None,
+    episode: EpisodeTruthReading | None,
     tick: Watched | None,
     outcomes: Sequence[EpisodeResult],
     weights: Mapping[str, str] | None = None,

@@ -70,7 +70,7 @@ class AgentNode(ModuleNode[Agent]):
         """Act for one tick."""
         seen = {name: inputs[_SIGHTS[name].topic.name][None] for name in self._sees}
         torque, self.state = self.module.step(AgentInput(**seen), self.state)
-        return [Output(self._publisher, conversions.torque_to_msg(episode.header, torque[0]))]
+        return self.say(episode, conversions.torque_value(torque[0]), conversions.torque_to_msg)
 
 
 def main(args: Sequence[str] | None = None) -> int:

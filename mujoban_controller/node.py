@@ -44,7 +44,7 @@ class ControllerNode(ModuleNode[Controller]):
             ),
             self.state,
         )
-        return [Output(self._publisher, conversions.torque_to_msg(episode.header, torque[0]))]
+        return self.say(episode, conversions.torque_value(torque[0]), conversions.torque_to_msg)
 
 
 def main(args: Sequence[str] | None = None) -> int:

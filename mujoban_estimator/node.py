@@ -8,7 +8,6 @@ if __name__ == "__main__":
     end_at_once()
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 from mujoban_msgs.msg import Episode
@@ -16,7 +15,6 @@ from mujoban_msgs.msg import Episode
 from mujoban_core.interfaces import Estimator, EstimatorInput, GroundTruth
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.adapted import Adapted
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
 
@@ -35,9 +33,7 @@ class EstimatorNode(ModuleNode[Estimator]):
         """Estimate the abstract state of one tick."""
         frame, pose = inputs[topics.CAMERA.name], inputs[topics.POSE.name]
         estimate, self.state = self.module.step(EstimatorInput(frame[None], pose[None], truth), self.state)
-        value = conversions.abstract_state_value(estimate[0])
-        to_msg = partial(conversions.abstract_state_to_msg, episode.header)
-        return [Output(self._publisher, Adapted(conversions.stamp_of(episode), value, to_msg))]
+        return self.say(episode, conversions.abstract_state_value(estimate[0]), conversions.abstract_state_to_msg)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -91,14 +91,13 @@ class TerminationNode(ModuleNode[Termination]):
             state,
         )
         self.state = state, beta.terminated
-        message = conversions.termination_to_msg(
-            episode.header,
+        value = conversions.termination_value(
             0 if previous is None else previous.sequence,
             beta.probability[0],
             beta.terminated[0],
             beta.timed_out[0],
         )
-        return [Output(self._publisher, message)]
+        return self.say(episode, value, conversions.termination_to_msg)
 
     def _previous(self, stamp: int) -> conversions.InstructionReading | None:
         """Return the instruction of the tick before a stamp, or the latest that is known."""

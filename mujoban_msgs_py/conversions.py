@@ -35,6 +35,8 @@ ENCODING: Final = "rgb8"
 _SECOND: Final = 1_000_000_000
 _ROUNDED_PI: Final = float(np.float32(math.pi))
 _LARGEST: Final[dict[type[np.floating[Any]], float]] = {t: float(np.finfo(t).max) for t in (np.float32, np.float64)}
+_SAFE: Final = 1e76
+"""Sum of squares below which every number has a place in either type."""
 _INERTIAL: Final = ("linear_velocity", "angular_velocity", "linear_acceleration")
 
 
@@ -223,9 +225,15 @@ class InstructionReading(NamedTuple):
     direction: int
 
 
-def instruction_to_msg(header: Header, sequence: int, direction: int) -> Instruction:
+def instruction_value(sequence: int, direction: int) -> InstructionReading:
+    """Return A and its number in the episode as their message carries them."""
+    return InstructionReading(int(sequence), _direction(direction))
+
+
+def instruction_to_msg(header: Header, reading: InstructionReading) -> Instruction:
     """Return A and its number in the episode."""
-    return Instruction(header=header, sequence=int(sequence), direction=_direction(direction))
+    sequence, direction = instruction_value(*reading)
+    return Instruction(header=header, sequence=sequence, direction=direction)
 
 
 def instruction_from_msg(message: Instruction) -> InstructionReading:
@@ -242,17 +250,17 @@ class TerminationReading(NamedTuple):
     timed_out: bool
 
 
-def termination_to_msg(
-    header: Header, sequence: int, probability: float, terminated: bool, timed_out: bool = False
-) -> Termination:
-    """Return beta, which is about the instruction of number `sequence`."""
-    return Termination(
-        header=header,
-        sequence=int(sequence),
-        probability=float(np.float32(_probability(probability))),
-        terminated=bool(terminated),
-        timed_out=bool(timed_out),
-    )
+def termination_value(
+    sequence: int, probability: float, terminated: bool, timed_out: bool = False
+) -> TerminationReading:
+    """Return beta, which is about the instruction of number `sequence`, as its message carries it."""
+    rounded = float(np.float32(_probability(probability)))
+    return TerminationReading(int(sequence), rounded, bool(terminated), bool(timed_out))
+
+
+def termination_to_msg(header: Header, reading: TerminationReading) -> Termination:
+    """Return beta, its probability and what it is about."""
+    return Termination(header=header, **termination_value(*reading)._asdict())
 
 
 def termination_from_msg(message: Termination) -> TerminationReading:
@@ -263,13 +271,21 @@ def termination_from_msg(message: Termination) -> TerminationReading:
 
 def torque_to_msg(header: Header, torque: ArrayLike, joints: Sequence[str] = ()) -> JointState:
     """Return torques normalised to [-1, 1], [U]."""
-    values = _torque(torque, None).astype(np.float64)
+    values = torque_value(torque).astype(np.float64)
     return JointState(header=header, name=list(joints), effort=array("d", values.tobytes()))
 
 
-def torque_from_msg(message: JointState, size: int | None = None) -> NDArray[np.float32]:
-    """Return torques normalised to [-1, 1], [U]; U = `size` unless that is None."""
-    return _torque(message.effort, size)
+def torque_value(torque: ArrayLike) -> NDArray[np.float32]:
+    """Return a copy of torques normalised to [-1, 1], [U], as their message carries them."""
+    values = finite("torque", torque, (None,), np.float32)
+    if not all(-1.0 <= value <= 1.0 for value in values.tolist()):
+        raise ConversionError(f"torque must lie in [-1, 1], got {values.tolist()}")
+    return values
+
+
+def torque_from_msg(message: JointState) -> NDArray[np.float32]:
+    """Return torques normalised to [-1, 1], [U]."""
+    return torque_value(message.effort)
 
 
 # Ground truth
@@ -335,11 +351,10 @@ class EpisodeTruthReading(NamedTuple):
     boxes_on_target: int
 
 
-def episode_truth_to_msg(header: Header, reading: EpisodeTruthReading) -> EpisodeTruth:
-    """Return the truth about an episode."""
+def episode_truth_value(reading: EpisodeTruthReading) -> EpisodeTruthReading:
+    """Return the truth about an episode as its message carries it."""
     reward, total = finite("reward and return", (reading.reward, reading.episode_return), (2,), np.float32).tolist()
-    return EpisodeTruth(
-        header=header,
+    return EpisodeTruthReading(
         episode=int(reading.episode),
         seed=int(reading.seed),
         difficulty=int(reading.difficulty),
@@ -352,6 +367,11 @@ def episode_truth_to_msg(header: Header, reading: EpisodeTruthReading) -> Episod
         truncated=bool(reading.truncated),
         boxes_on_target=int(reading.boxes_on_target),
     )
+
+
+def episode_truth_to_msg(header: Header, reading: EpisodeTruthReading) -> EpisodeTruth:
+    """Return the truth about an episode."""
+    return EpisodeTruth(header=header, **episode_truth_value(reading)._asdict())
 
 
 def episode_truth_from_msg(message: EpisodeTruth) -> EpisodeTruthReading:
@@ -369,22 +389,17 @@ def episode_truth_from_msg(message: EpisodeTruth) -> EpisodeTruthReading:
 def finite(what: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
     """Return values as an array after a check of shape (None: any length) and finiteness."""
     result = np.asarray(values, np.float64)
-    if len(result.shape) != len(shape) or any(
-        want not in (None, have) for want, have in zip(shape, result.shape, strict=True)
-    ):
+    if result.shape != shape and not _fits(result.shape, shape):
         expected = ", ".join("any" if n is None else str(n) for n in shape)
         raise ConversionError(f"{what} must have shape [{expected}], got {list(result.shape)}")
-    # Written so that NaN fails as well, and what has no place in the type.
-    if not (np.abs(result) <= _LARGEST[dtype]).all():
+    # Written so that NaN fails as well, and what has no place in the type. The sum tells in a quarter of the time.
+    if not np.vdot(result, result) <= _SAFE and not (np.abs(result) <= _LARGEST[dtype]).all():
         raise ConversionError(f"{what} must be finite, got {result.tolist()}")
     return result.astype(dtype, copy=False)
 
 
-def _torque(values: ArrayLike, size: int | None) -> NDArray[np.float32]:
-    torque = finite("torque", values, (size,), np.float32)
-    if torque.size and np.abs(torque).max() > 1.0:
-        raise ConversionError(f"torque must lie in [-1, 1], got {torque.tolist()}")
-    return torque
+def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(wanted) and all(want in (None, have) for want, have in zip(wanted, shape, strict=True))
 
 
 def _check_probability(what: str, values: NDArray[np.floating[Any]]) -> None:

@@ -16,6 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from mujoban_msgs_py.arrivals import Arrival, Handed, Receive, Serialised
+from mujoban_msgs_py.conversions import ConversionError
 from mujoban_msgs_py.decoders import DECODERS, Decode
 from mujoban_msgs_py.raw import Steady
 from mujoban_msgs_py.run_identifier import ANY, run_of
@@ -78,6 +79,7 @@ def listen(
     *,
     qos: QoSProfile | None = None,
     decode: Decode | None = None,
+    otherwise: Callable[[ConversionError], Any] | None = None,
     steady: bool = False,
 ) -> Subscription:
     """Subscribe to a topic of the graph.
@@ -89,18 +91,25 @@ def listen(
         receive: Called with every message that is sound.
         qos: The topic's own by default.
         decode: Reads a message, in place of the topic's reader; a ValueError drops it.
+        otherwise: Returns what stands for the content of a message that says what its topic does not carry.
         steady: Whether the topic says the same for many ticks, and its reader leaves the header out (see `Steady`).
     """
     reader = DECODERS[topic] if decode is None else decode
     repeated = Steady(topic.type, reader) if steady else None
 
+    def content_of(message: Arrival) -> Any:
+        try:
+            if repeated is None or isinstance(message, Handed):
+                return message.content(reader)
+            return repeated(message.raw)
+        except ConversionError as error:
+            if otherwise is None:
+                raise
+            return otherwise(error)
+
     def on_message(message: Arrival) -> None:
         try:
-            stamp = message.stamp
-            if repeated is None or isinstance(message, Handed):
-                content = message.content(reader)
-            else:
-                content = repeated(message.raw)
+            stamp, content = message.stamp, content_of(message)
         except ValueError as error:
             reject(node, topic.name, error)
             return

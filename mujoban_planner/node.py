@@ -106,8 +106,8 @@ class PlannerNode(ModuleNode[Planner]):
         """Hold the instruction in force or decide on a new one."""
         terminated = np.array([inputs[topics.TERMINATION.name].terminated])
         instruction, self.state = self.module.step(inputs[topics.ABSTRACT_STATE.name][None], terminated, self.state)
-        message = conversions.instruction_to_msg(episode.header, self.state.sequence[0], instruction[0])
-        return [Output(self._publisher, message)]
+        value = conversions.instruction_value(self.state.sequence[0], instruction[0])
+        return self.say(episode, value, conversions.instruction_to_msg)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.task import Future
-from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from mujoban_core.bodies import BALL, BODIES
@@ -169,7 +168,7 @@ class SimulatorNode(GraphNode):
         )
 
     def _listen(self) -> None:
-        listen(self, topics.TORQUE, self._on_torque, decode=self._read_torque)
+        listen(self, topics.TORQUE, self._on_torque, otherwise=self._no_torque)
         # What a planner said before this simulator came must not arrive.
         listen(self, topics.INSTRUCTION, self._on_instruction, qos=live_qos())
         for topic in self._witnesses:
@@ -218,7 +217,7 @@ class SimulatorNode(GraphNode):
     def _begin(self, index: int) -> None:
         self._place = self._place._replace(index=index, starts=self._place.starts + 1)
         self.world.reset([0], [self.episodes[index]])
-        self._held_torque[:] = 0.0
+        self._held_torque = np.zeros_like(self._held_torque)  # others share what a message holds
         self._in_force = conversions.InstructionReading(0, 0)
         self._first = self._stamp + TICK
         self._next()
@@ -314,23 +313,24 @@ class SimulatorNode(GraphNode):
 
     # Answers
 
-    def _read_torque(self, message: JointState) -> NDArray[np.float32]:
-        """Return the torque of a message; of a controller that says nonsense, zero."""
-        try:
-            return conversions.torque_from_msg(message, self.world.body.action_size)
-        except ValueError as error:
-            self._reject("rejected torques", f"rejected a torque, zero is held instead: {error}")
-            return np.zeros_like(self._held_torque)
+    def _no_torque(self, error: conversions.ConversionError) -> NDArray[np.float32]:
+        """Return what is held for a controller that says nonsense: zero."""
+        self._reject("rejected torques", f"rejected a torque, zero is held instead: {error}")
+        return np.zeros_like(self._held_torque)
 
     def _on_torque(self, message: Received) -> None:
+        torque, expected = message.content, self._held_torque.shape
+        if torque.shape != expected:
+            said = f"torque must have shape {[*expected]}, got {[*torque.shape]}"
+            torque = self._no_torque(conversions.ConversionError(said))
         if not self._is_known(message.stamp, topics.TORQUE.name):
             return
         self.pace.hear(message.stamp, time.perf_counter())
         if message.stamp == self._stamp:
-            self._torque = message.content
+            self._torque = torque
             self._proceed()
         elif self._speed > 0 and self._torque is None and message.stamp >= self._first:
-            self._held_torque = message.content
+            self._held_torque = torque
 
     def _on_instruction(self, message: Received) -> None:
         if not self._is_known(message.stamp, topics.INSTRUCTION.name):

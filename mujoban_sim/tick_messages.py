@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import PoseArray
-from mujoban_msgs.msg import Episode, EpisodeTruth, Termination
+from mujoban_msgs.msg import Episode
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
@@ -108,7 +108,7 @@ class TickComposer:
         reading = conversions.EpisodeReading(tick.label.episode, progress.step, progress.solved or progress.truncated)
         return conversions.episode_to_msg(_map(tick), reading)
 
-    def _true_episode(self, tick: SimulatorTick) -> EpisodeTruth:
+    def _true_episode(self, tick: SimulatorTick) -> Adapted:
         label, progress = tick.label, tick.progress
         if progress.spec is not self._spec:
             self._spec, self._level_text = progress.spec, progress.spec.level.to_text()
@@ -124,9 +124,10 @@ class TickComposer:
             solved=progress.solved,
             terminated=progress.solved,
             truncated=progress.truncated,
-            boxes_on_target=int((state[..., BOX] * state[..., TARGET]).sum()),
+            boxes_on_target=int(np.vdot(state[..., BOX], state[..., TARGET])),
         )
-        return conversions.episode_truth_to_msg(_map(tick), reading)
+        to_msg = partial(conversions.episode_truth_to_msg, _map(tick))
+        return Adapted(label.stamp, conversions.episode_truth_value(reading), to_msg)
 
     def _camera(self, tick: SimulatorTick) -> Adapted:
         header = _header(tick.label.stamp, topics.CAMERA_FRAME)
@@ -152,9 +153,10 @@ class TickComposer:
         present = tick.truth.box_position[tick.row, : len(tick.progress.spec.level.boxes)]
         return conversions.boxes_to_msg(_map(tick), present)
 
-    def _termination(self, tick: SimulatorTick) -> Termination:
+    def _termination(self, tick: SimulatorTick) -> Adapted:
         completed = bool(tick.truth.completed[tick.row])
-        return conversions.termination_to_msg(_map(tick), tick.label.sequence, float(completed), completed)
+        value = conversions.termination_value(tick.label.sequence, float(completed), completed)
+        return Adapted(tick.label.stamp, value, partial(conversions.termination_to_msg, _map(tick)))
 
 
 def _pose(tick: SimulatorTick, pose: NDArray[np.float32]) -> Adapted:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, Unpack, cast
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
+from std_msgs.msg import Header
 
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.interfaces import GroundTruth, Module, module_seeds
@@ -20,12 +22,12 @@ from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
 from mujoban_core.plugins import LEARNED, PRIVILEGED, check_body, check_told, chosen_weights, load_module
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.adapted import message_of
+from mujoban_msgs_py.adapted import Adapted, message_of
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS, Condition
 from mujoban_msgs_py.runtime.kept import KeptArrays, leaves, with_leaves
 from mujoban_msgs_py.runtime.tick_node import Input, Output, TickNode
-from mujoban_msgs_py.topics import Topic
+from mujoban_msgs_py.topics import Message, Topic
 
 MOST_TICKS = 1_000_000
 """Upper end of ranges of ticks, which have none of their own."""
@@ -126,6 +128,11 @@ class ModuleNode(TickNode, Generic[ModuleT]):
     @abstractmethod
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
         """Advance `self.state` by one tick and return what to publish."""
+
+    def say(self, episode: Episode, value: Any, to_msg: Callable[[Header, Any], Message]) -> Sequence[Output]:
+        """Return a tick's answer: a value as the topic's reader has it, and what makes its message of a header."""
+        said = Adapted(conversions.stamp_of(episode), value, partial(to_msg, episode.header))
+        return [Output(self._publisher, said)]
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
         """Start `self.state` at the first tick that the module sees of an episode."""

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import pytest
-from mujoban_msgs.msg import EpisodeTruth
 
 from bringup.command import Choice, Stack
 from bringup.graph import NODES, InProcess, keep_memories
@@ -15,7 +14,7 @@ from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_core.plugins import ROLES
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.decoders import checked
+from mujoban_msgs_py.conversions import EpisodeTruthReading
 from mujoban_msgs_py.listening import listen
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos
@@ -32,7 +31,7 @@ class Said:
     instruction: dict[int, tuple[int, int]] = field(default_factory=dict)
     torque: dict[int, list[float]] = field(default_factory=dict)
     reward: dict[int, float] = field(default_factory=dict)
-    episodes: dict[int, EpisodeTruth] = field(default_factory=dict)
+    episodes: dict[int, EpisodeTruthReading] = field(default_factory=dict)
 
 
 class Tap(GraphNode):
@@ -42,7 +41,7 @@ class Tap(GraphNode):
         super().__init__("tap", intra_process=intra_process)
         self.said = Said()
         qos = live_qos(1000)
-        listen(self, topics.TRUE_EPISODE, self._episode, qos=qos, decode=checked(topics.TRUE_EPISODE))
+        listen(self, topics.TRUE_EPISODE, self._episode, qos=qos)
         listen(self, topics.INSTRUCTION, self._instruction, qos=qos)
         listen(self, topics.ABSTRACT_STATE, self._estimate, qos=qos)
         listen(self, topics.TORQUE, self._torque, qos=qos)

@@ -145,10 +145,10 @@ def test_the_last_end_counts_when_nothing_more_is_heard_though_no_tick_was_answe
 def _say_tick(monitor, tick):
     """Have the monitor hear what the modules of a graph say in a tick."""
     stamp, state = tick * topics.TICK, np.zeros((10, 10, 4), np.float32)
-    header = conversions.header(stamp)
+    header, beta = conversions.header(stamp), conversions.termination_value(1, 0.0, terminated=False)
     for topic, message in (
-        (topics.INSTRUCTION, conversions.instruction_to_msg(header, 1, 1)),
-        (topics.TERMINATION, conversions.termination_to_msg(header, 1, 0.0, False)),
+        (topics.INSTRUCTION, conversions.instruction_to_msg(header, conversions.InstructionReading(1, 1))),
+        (topics.TERMINATION, conversions.termination_to_msg(header, beta)),
         (topics.ABSTRACT_STATE, conversions.abstract_state_to_msg(header, state)),
         (topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_to_msg(header, state)),
     ):
@@ -195,7 +195,8 @@ def test_an_end_that_the_simulator_did_not_announce_is_taken_back_when_the_tick_
         reading = conversions.EpisodeReading(1, 2, ended)
         mouths[topics.EPISODE].publish(conversions.episode_to_msg(header, reading))
         mouths[topics.ABSTRACT_STATE].publish(state)
-        mouths[topics.TERMINATION].publish(conversions.termination_to_msg(header, 0, 0.0, False))
+        beta = conversions.termination_value(0, 0.0, terminated=False)
+        mouths[topics.TERMINATION].publish(conversions.termination_to_msg(header, beta))
 
     offer(ended=True)
     graph.spin_until(lambda: planner._handled == 3 * topics.TICK)
@@ -210,7 +211,9 @@ def test_messages_that_are_no_messages_are_named_by_topic(play_graph, capfd):
     publisher = graph.tap.create_publisher(topics.INSTRUCTION.type, topics.INSTRUCTION.name, topics.INSTRUCTION.qos)
     listeners = 5  # simulator, termination, controller, monitor and the test's tap
     graph.spin_until(lambda: graph.simulator.ticks >= 2 and publisher.get_subscription_count() == listeners)
-    nobody = conversions.instruction_to_msg(conversions.header(max(graph.said.instruction)), 1, 1)
+    nobody = conversions.instruction_to_msg(
+        conversions.header(max(graph.said.instruction)), conversions.InstructionReading(1, 1)
+    )
     nobody.direction = 9
     publisher.publish(nobody)
     publisher.publish(b"\x00\x01\x00\x00short")

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from mujoban_msgs.msg import EpisodeTruth
 from rich.console import Console
 
 from bringup.command import Choice, Solo, Stack
@@ -30,7 +29,7 @@ from mujoban_core import plugins
 from mujoban_core.interfaces import module_seeds
 from mujoban_core.plugins import AGENT, ROLES, SCOUT
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.conversions import InstructionReading, TerminationReading
+from mujoban_msgs_py.conversions import EpisodeTruthReading, InstructionReading, TerminationReading
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
@@ -272,7 +271,11 @@ def test_a_plugin_that_is_told_the_truth_is_named_so_everywhere(cheaters):
         topics.TERMINATION.name: TerminationReading(1, 0.0, False, False),
         topics.ABSTRACT_STATE.name: state, topics.TRUE_ABSTRACT_STATE.name: state,
     }  # fmt: skip
+    episode = EpisodeTruthReading(
+        1, 0, 5, level="", step=0, reward=0.0, episode_return=0.0, solved=False, terminated=False, truncated=False,
+        boxes_on_target=0,
+    )  # fmt: skip
     console = Console(width=120, record=True)
-    console.print(live_view(EpisodeTruth(), Watched(values), [], identities))
+    console.print(live_view(episode, Watched(values), [], identities))
     (line,) = [line for line in console.export_text().splitlines() if "privileged" in line]
     assert "planner" in line

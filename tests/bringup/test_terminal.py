@@ -5,7 +5,6 @@ import re
 
 import numpy as np
 import pytest
-from mujoban_msgs.msg import EpisodeTruth
 from rich.console import Console
 
 from bringup.monitor import Watched
@@ -15,11 +14,15 @@ from bringup.results import EpisodeResult, Failure
 from bringup.training_display import Display
 from bringup.view import live_view, summary
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.conversions import InstructionReading, TerminationReading
+from mujoban_msgs_py.conversions import EpisodeTruthReading, InstructionReading, TerminationReading
 from mujoban_sokoban.levels import Level
 
 SOLVED = EpisodeResult(3, True, 11.0, 50, 4, 0, 0, None)
 LOST = EpisodeResult(1_000_000_007, False, -120.0, 2400, 128, 12, 34, Failure.CONTROLLER_TIME_OUT)
+EPISODE = EpisodeTruthReading(
+    3, LOST.seed, 5, level="", step=1234, reward=-0.1, episode_return=-12.0, solved=False, terminated=False,
+    truncated=False, boxes_on_target=0,
+)  # fmt: skip
 
 
 def printed(what, width):
@@ -48,8 +51,7 @@ def test_the_table_of_episodes_shows_every_number_whole(width):
 def test_of_an_agent_without_modules_the_live_view_shows_torques_and_the_truth(width):
     state = Level.from_text("######\n#+$*.#\n#   $#\n######\n").abstract_state()
     values = {topics.TORQUE.name: np.array([0.25, -1.0], np.float32), topics.TRUE_ABSTRACT_STATE.name: state}
-    episode = EpisodeTruth(episode=3, seed=LOST.seed, difficulty=5, step=1234, episode_return=-12.0)
-    text = " ".join(printed(live_view(episode, Watched(values), [], {"agent": "random"}, width=width), width))
+    text = " ".join(printed(live_view(EPISODE, Watched(values), [], {"agent": "random"}, width=width), width))
     assert "+0.25 -1.00" in text and "ground truth" in text
     assert "estimate" not in text and "instruction" not in text and "termination" not in text
 
@@ -65,8 +67,7 @@ def test_the_live_view_fits_the_width_with_both_maps_side_by_side(width):
         }
     )  # fmt: skip
     roles = ("estimator", "termination", "planner", "controller")
-    episode = EpisodeTruth(episode=3, seed=LOST.seed, difficulty=5, step=1234, episode_return=-12.0)
-    lines = printed(live_view(episode, tick, [SOLVED], dict.fromkeys(roles, "oracle"), width=width), width)
+    lines = printed(live_view(EPISODE, tick, [SOLVED], dict.fromkeys(roles, "oracle"), width=width), width)
     assert len(lines) < 24, "with the prompt it fits a terminal of 24 lines"
     assert any("estimate" in line and "ground truth" in line for line in lines)
     text = " ".join(" ".join(lines).replace("│", " ").split())

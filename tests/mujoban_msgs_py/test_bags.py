@@ -32,7 +32,7 @@ def messages_of(tick):
     said = {
         topics.CAMERA: conversions.frame_to_msg(header, frame(tick)),
         topics.POSE: conversions.pose_to_msg(header, (tick, 0.5, 0.25)),
-        topics.INSTRUCTION: conversions.instruction_to_msg(header, tick, tick % 5),
+        topics.INSTRUCTION: conversions.instruction_to_msg(header, conversions.InstructionReading(tick, tick % 5)),
     }
     return [(topic.name, serialize_message(message)) for topic, message in said.items()]
 

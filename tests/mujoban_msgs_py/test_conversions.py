@@ -78,14 +78,15 @@ def test_abstract_states_round_trip(state):
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 4))
 def test_instructions_round_trip(sequence, direction):
-    for received in over_the_wire(c.instruction_to_msg(HEADER, np.int64(sequence), np.int64(direction))):
+    reading = c.InstructionReading(np.int64(sequence), np.int64(direction))
+    for received in over_the_wire(c.instruction_to_msg(HEADER, reading)):
         assert c.instruction_from_msg(received) == (sequence, direction)
 
 
 @given(st.integers(0, 2**32 - 1), probability, st.booleans(), st.booleans())
 def test_terminations_round_trip(sequence, p, terminated, timed_out):
-    message = c.termination_to_msg(HEADER, sequence, np.float32(p), np.bool_(terminated), np.bool_(timed_out))
-    for received in over_the_wire(message):
+    reading = c.TerminationReading(sequence, np.float32(p), np.bool_(terminated), np.bool_(timed_out))
+    for received in over_the_wire(c.termination_to_msg(HEADER, reading)):
         assert c.termination_from_msg(received) == (sequence, p, terminated, timed_out)
 
 
@@ -142,15 +143,17 @@ def test_wrong_images_are_named(message, expected):
         (lambda: c.frame_to_msg(HEADER, np.zeros((64, 64, 3))), r"must be uint8 \[H, W, 3\], got float64"),
         (lambda: c.torque_to_msg(HEADER, [math.nan, 0]), "torque must be finite"),
         (lambda: c.torque_to_msg(HEADER, [1.5, 0]), r"torque must lie in \[-1, 1\]"),
-        (lambda: c.torque_from_msg(c.torque_to_msg(HEADER, [0.5]), 2), r"shape \[2\], got \[1\]"),
+        (lambda: c.torque_to_msg(HEADER, [[0.5]]), r"shape \[any\], got \[1, 1\]"),
         (lambda: c.pose_to_msg(HEADER, [0, 0]), r"pose must have shape \[3\], got \[2\]"),
         (lambda: c.pose_to_msg(HEADER, [0, 0, math.inf]), "pose must be finite"),
         (lambda: c.proprio_to_msg(HEADER, np.zeros(13), ["a"]), r"shape \[14\], got \[13\]"),
         (lambda: c.abstract_state_to_msg(HEADER, np.zeros((10, 10, 3))), r"rows, columns, 4\], got \[10, 10, 3\]"),
         (lambda: c.abstract_state_to_msg(HEADER, np.full((10, 10, 4), np.nan)), "probabilities in"),
         (lambda: c.abstract_state_from_msg(c.abstract_state_to_msg(HEADER, np.zeros((7, 7, 4)))), "10x10 cells"),
-        (lambda: c.instruction_to_msg(HEADER, 1, 5), r"direction must be one of 0 \(STAY\).* got 5"),
-        (lambda: c.termination_to_msg(HEADER, 1, math.nan, True), "probability must lie in"),
+        (lambda: c.instruction_value(1, 5), r"direction must be one of 0 \(STAY\).* got 5"),
+        (lambda: c.instruction_to_msg(HEADER, c.InstructionReading(1, 5)), "direction must be one of"),
+        (lambda: c.termination_value(1, math.nan, terminated=True), "probability must lie in"),
+        (lambda: c.termination_to_msg(HEADER, c.TerminationReading(1, 2.0, True, False)), "probability must lie in"),
         (lambda: c.boxes_to_msg(HEADER, [[0, math.nan]]), "box positions must be finite"),
     ],
 )

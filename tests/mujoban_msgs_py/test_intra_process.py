@@ -112,7 +112,9 @@ def test_who_joins_late_hears_the_latest_message_of_a_latched_topic(company):
     output = said.create_output(topics.INSTRUCTION)
 
     def say(sequence):
-        output.publish(conversions.instruction_to_msg(conversions.header(sequence * topics.TICK), sequence, 3))
+        output.publish(conversions.instruction_to_msg(
+            conversions.header(sequence * topics.TICK), conversions.InstructionReading(sequence, 3)
+        ))
 
     for latest in (2, 4):  # what a stranger has heard before is kept for nobody
         say(latest - 1)
@@ -188,13 +190,14 @@ def test_a_message_of_a_value_that_its_topic_does_not_carry_is_rejected(company)
 
 @pytest.mark.parametrize("value", [0.1, 1 / 3])
 def test_numbers_are_rounded_where_a_message_is_made_as_they_are_where_it_is_sent(value):
-    said = conversions.termination_to_msg(conversions.header(0), 1, value, False).probability
-    assert said == float(np.float32(value)) != value
+    reading = conversions.TerminationReading(1, value, terminated=False, timed_out=False)
+    said = conversions.termination_to_msg(conversions.header(0), reading).probability
+    assert said == conversions.termination_value(*reading).probability == float(np.float32(value)) != value
 
 
 def test_a_probability_above_one_by_less_than_rounding_is_refused():
     header, above = conversions.header(0), 1.0 + 1e-9
     with pytest.raises(conversions.ConversionError):
-        conversions.termination_to_msg(header, 1, above, False)
+        conversions.termination_value(1, above, terminated=False)
     with pytest.raises(conversions.ConversionError):
         conversions.abstract_state_to_msg(header, np.full((10, 10, 4), above))
