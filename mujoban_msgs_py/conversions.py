@@ -28,20 +28,13 @@ from std_msgs.msg import Header
 from mujoban_core.bodies import BODIES, ProprioSlices
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, DIFFICULTIES, GRID_SIZE
-from mujoban_core.grid import Instruction as Direction
+from mujoban_msgs_py.checks import ConversionError, check_probabilities, checked_direction, checked_probability, finite
 from mujoban_msgs_py.topics import Message
 
 ENCODING: Final = "rgb8"
 _SECOND: Final = 1_000_000_000
 _ROUNDED_PI: Final = float(np.float32(math.pi))
-_LARGEST: Final[dict[type[np.floating[Any]], float]] = {t: float(np.finfo(t).max) for t in (np.float32, np.float64)}
-_SAFE: Final = 1e76
-"""Sum of squares below which every number has a place in either type."""
 _INERTIAL: Final = ("linear_velocity", "angular_velocity", "linear_acceleration")
-
-
-class ConversionError(ValueError):
-    """A message or an array is not what its topic carries."""
 
 
 # Time
@@ -199,7 +192,7 @@ def abstract_state_value(state: NDArray[np.floating[Any]]) -> NDArray[np.float32
     """Return a copy of s_abst or of an estimate of it as its message carries it."""
     if state.ndim != 3 or state.shape[2] != len(CHANNELS):
         raise ConversionError(f"abstract state must be [rows, columns, {len(CHANNELS)}], got {list(state.shape)}")
-    _check_probability("abstract state", state)
+    check_probabilities("abstract state", state)
     return state.astype(np.float32)
 
 
@@ -214,7 +207,7 @@ def abstract_state_from_msg(message: AbstractState, size: int | None = GRID_SIZE
         if layer.size != rows * cols:
             raise ConversionError(f"layer {name!r} of {rows}x{cols} cells must have {rows * cols}, got {layer.size}")
         state[..., channel] = layer.reshape(rows, cols)
-    _check_probability("abstract state", state)
+    check_probabilities("abstract state", state)
     return state
 
 
@@ -227,7 +220,7 @@ class InstructionReading(NamedTuple):
 
 def instruction_value(sequence: int, direction: int) -> InstructionReading:
     """Return A and its number in the episode as their message carries them."""
-    return InstructionReading(int(sequence), _direction(direction))
+    return InstructionReading(int(sequence), checked_direction(direction))
 
 
 def instruction_to_msg(header: Header, reading: InstructionReading) -> Instruction:
@@ -238,7 +231,7 @@ def instruction_to_msg(header: Header, reading: InstructionReading) -> Instructi
 
 def instruction_from_msg(message: Instruction) -> InstructionReading:
     """Return A and its number in the episode."""
-    return InstructionReading(message.sequence, _direction(message.direction))
+    return InstructionReading(message.sequence, checked_direction(message.direction))
 
 
 class TerminationReading(NamedTuple):
@@ -254,7 +247,7 @@ def termination_value(
     sequence: int, probability: float, terminated: bool, timed_out: bool = False
 ) -> TerminationReading:
     """Return beta, which is about the instruction of number `sequence`, as its message carries it."""
-    rounded = float(np.float32(_probability(probability)))
+    rounded = float(np.float32(checked_probability(probability)))
     return TerminationReading(int(sequence), rounded, bool(terminated), bool(timed_out))
 
 
@@ -265,8 +258,9 @@ def termination_to_msg(header: Header, reading: TerminationReading) -> Terminati
 
 def termination_from_msg(message: Termination) -> TerminationReading:
     """Return beta, its probability and what it is about."""
-    probability = _probability(message.probability)
-    return TerminationReading(message.sequence, probability, bool(message.terminated), bool(message.timed_out))
+    return TerminationReading(
+        message.sequence, checked_probability(message.probability), bool(message.terminated), bool(message.timed_out)
+    )
 
 
 def torque_to_msg(header: Header, torque: ArrayLike, joints: Sequence[str] = ()) -> JointState:
@@ -381,41 +375,3 @@ def episode_truth_from_msg(message: EpisodeTruth) -> EpisodeTruthReading:
     if reading.difficulty not in (0, *DIFFICULTIES):
         raise ConversionError(f"difficulty must be 0 or one of {sorted(DIFFICULTIES)}, got {reading.difficulty}")
     return reading
-
-
-# Checks
-
-
-def finite(what: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: type[np.floating[Any]]) -> NDArray[Any]:
-    """Return values as an array after a check of shape (None: any length) and finiteness."""
-    result = np.asarray(values, np.float64)
-    if result.shape != shape and not _fits(result.shape, shape):
-        expected = ", ".join("any" if n is None else str(n) for n in shape)
-        raise ConversionError(f"{what} must have shape [{expected}], got {list(result.shape)}")
-    # Written so that NaN fails as well, and what has no place in the type. The sum tells in a quarter of the time.
-    if not np.vdot(result, result) <= _SAFE and not (np.abs(result) <= _LARGEST[dtype]).all():
-        raise ConversionError(f"{what} must be finite, got {result.tolist()}")
-    return result.astype(dtype, copy=False)
-
-
-def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(wanted) and all(want in (None, have) for want, have in zip(wanted, shape, strict=True))
-
-
-def _check_probability(what: str, values: NDArray[np.floating[Any]]) -> None:
-    # Written so that NaN fails as well.
-    if values.size and not (values.min() >= 0.0 and values.max() <= 1.0):
-        raise ConversionError(f"{what} must hold probabilities in [0, 1], got {values.min()} to {values.max()}")
-
-
-def _probability(value: float) -> float:
-    if not 0.0 <= (probability := float(value)) <= 1.0:
-        raise ConversionError(f"probability must lie in [0, 1], got {probability}")
-    return probability
-
-
-def _direction(value: int) -> int:
-    if not 0 <= (direction := int(value)) < len(Direction):
-        names = ", ".join(f"{d.value} ({d.name})" for d in Direction)
-        raise ConversionError(f"direction must be one of {names}, got {direction}")
-    return direction

@@ -17,7 +17,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.topics import Message, Topic
 
 Decode = Callable[[Any], Any]
-"""Turns a message into a value, or raises `conversions.ConversionError`."""
+"""Turns a message into a value, or raises `ConversionError`."""
 
 
 def _any_size(message: Image) -> NDArray[np.uint8]:

@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from mujoban_msgs_py.arrivals import Arrival, Handed, Receive, Serialised
-from mujoban_msgs_py.conversions import ConversionError
+from mujoban_msgs_py.checks import ConversionError
 from mujoban_msgs_py.decoders import DECODERS, Decode
 from mujoban_msgs_py.raw import Steady
 from mujoban_msgs_py.run_identifier import ANY, run_of

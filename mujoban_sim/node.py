@@ -19,6 +19,7 @@ from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES, FASTEST
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.checks import ConversionError
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
@@ -313,7 +314,7 @@ class SimulatorNode(GraphNode):
 
     # Answers
 
-    def _no_torque(self, error: conversions.ConversionError) -> NDArray[np.float32]:
+    def _no_torque(self, error: ConversionError) -> NDArray[np.float32]:
         """Return what is held for a controller that says nonsense: zero."""
         self._reject("rejected torques", f"rejected a torque, zero is held instead: {error}")
         return np.zeros_like(self._held_torque)
@@ -322,7 +323,7 @@ class SimulatorNode(GraphNode):
         torque, expected = message.content, self._held_torque.shape
         if torque.shape != expected:
             said = f"torque must have shape {[*expected]}, got {[*torque.shape]}"
-            torque = self._no_torque(conversions.ConversionError(said))
+            torque = self._no_torque(ConversionError(said))
         if not self._is_known(message.stamp, topics.TORQUE.name):
             return
         self.pace.hear(message.stamp, time.perf_counter())

@@ -22,6 +22,7 @@ from mujoban_core.grid import BOX, TARGET
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.adapted import Adapted, message_of
+from mujoban_msgs_py.checks import finite
 from mujoban_msgs_py.topics import Message, Topic
 from mujoban_sokoban.episodes import EpisodeSpec
 
@@ -142,7 +143,7 @@ class TickComposer:
         to_msg = partial(
             conversions.proprio_to_msg, _header(tick.label.stamp, topics.BODY_FRAME), joints=self._joints
         )
-        proprio = conversions.finite("proprio", tick.observation.proprio[tick.row], (None,), np.float32)
+        proprio = finite("proprio", tick.observation.proprio[tick.row], (None,), np.float32)
         return Adapted(tick.label.stamp, proprio, to_msg)
 
     def _abstract_state(self, tick: SimulatorTick) -> Adapted:
@@ -160,7 +161,7 @@ class TickComposer:
 
 
 def _pose(tick: SimulatorTick, pose: NDArray[np.float32]) -> Adapted:
-    value = conversions.finite("pose", pose[tick.row], (3,), np.float32)
+    value = finite("pose", pose[tick.row], (3,), np.float32)
     return Adapted(tick.label.stamp, value, partial(conversions.pose_to_msg, _map(tick)))
 
 

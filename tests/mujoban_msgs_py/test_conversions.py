@@ -9,6 +9,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from mujoban_msgs_py import conversions as c
 from mujoban_msgs_py.bags import TypeRegistry
+from mujoban_msgs_py.checks import ConversionError
 from mujoban_msgs_py.topics import GRAPH_TOPICS
 
 HEADER = c.header(7_050_000_000, "map")
@@ -133,7 +134,7 @@ def image(**changes):
     ],
 )
 def test_wrong_images_are_named(message, expected):
-    with pytest.raises(c.ConversionError, match=expected):
+    with pytest.raises(ConversionError, match=expected):
         c.frame_from_msg(message)
 
 
@@ -158,21 +159,21 @@ def test_wrong_images_are_named(message, expected):
     ],
 )
 def test_what_is_not_a_topics_content_never_becomes_a_message(make, expected):
-    with pytest.raises(c.ConversionError, match=expected):
+    with pytest.raises(ConversionError, match=expected):
         make()
 
 
 def test_a_pose_without_orientation_is_refused():
     message = c.pose_to_msg(HEADER, (0, 0, 0))
     message.pose.orientation.w = 0.0
-    with pytest.raises(c.ConversionError, match="unit quaternion"):
+    with pytest.raises(ConversionError, match="unit quaternion"):
         c.pose_from_msg(message)
 
 
 def test_a_layer_of_the_wrong_size_is_named():
     message = c.abstract_state_to_msg(HEADER, np.zeros((10, 10, 4)))
     message.box = message.box[:99]
-    with pytest.raises(c.ConversionError, match="layer 'box' of 10x10 cells must have 100, got 99"):
+    with pytest.raises(ConversionError, match="layer 'box' of 10x10 cells must have 100, got 99"):
         c.abstract_state_from_msg(message)
 
 

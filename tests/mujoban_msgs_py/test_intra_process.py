@@ -11,6 +11,7 @@ from rclpy.node import Node
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.arrivals import Handed
+from mujoban_msgs_py.checks import ConversionError
 from mujoban_msgs_py.listening import listen, subscribe
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.intra_process import LATE_JOINER_PERIOD, IntraProcess
@@ -197,7 +198,7 @@ def test_numbers_are_rounded_where_a_message_is_made_as_they_are_where_it_is_sen
 
 def test_a_probability_above_one_by_less_than_rounding_is_refused():
     header, above = conversions.header(0), 1.0 + 1e-9
-    with pytest.raises(conversions.ConversionError):
+    with pytest.raises(ConversionError):
         conversions.termination_value(1, above, terminated=False)
-    with pytest.raises(conversions.ConversionError):
+    with pytest.raises(ConversionError):
         conversions.abstract_state_to_msg(header, np.full((10, 10, 4), above))

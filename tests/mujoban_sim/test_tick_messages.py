@@ -6,7 +6,7 @@ import pytest
 from mujoban_core.bodies import get_body
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_msgs_py.adapted import Adapted
-from mujoban_msgs_py.conversions import ConversionError
+from mujoban_msgs_py.checks import ConversionError
 from mujoban_msgs_py.decoders import DECODERS
 from mujoban_msgs_py.topics import POSE, PROPRIO
 from mujoban_sim.tick_messages import EpisodeProgress, SimulatorTick, TickComposer, TickLabel
