@@ -34,7 +34,7 @@ class Options:
 
     ticks: int = 300
     """Of each contestant in a round."""
-    rounds: int = 8
+    rounds: int = 16
     difficulty: int = 5
     seed: int = VALIDATION_SEEDS.start
     oracle: tuple[str, ...] = ()
