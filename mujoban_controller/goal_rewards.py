@@ -22,7 +22,7 @@ from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction
 from mujoban_sim.driving import forward_speed
 from mujoban_sim.goals import GoalKind
 
-_REACH = 0.6
+REACH = 0.6
 """Distance in cells from the robot to the box that it pushes, beyond which it is told to come nearer."""
 
 _PLACE = 0.3
@@ -88,7 +88,7 @@ def potential(world: GoalView, config: RewardConfig) -> NDArray[np.float64]:
     apart = (box - robot) / size
     push = -np.abs((left * direction).sum(1))
     push -= config.lane * np.abs((apart * normal).sum(1))
-    push -= config.gap * np.maximum((apart * direction).sum(1) - _REACH, 0.0)
+    push -= config.gap * np.maximum((apart * direction).sum(1) - REACH, 0.0)
     push -= config.aside * np.maximum(np.abs((left * normal).sum(1)) - 0.02, 0.0)
     near = np.where(goals.kind == GoalKind.PUSH, push, move)
     if world.body.turn is None:

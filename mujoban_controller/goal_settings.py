@@ -43,8 +43,8 @@ class GoalTaskConfig:
     misaligned: float = 0.5
     """Share of episodes that begin with robot and boxes off the centres of their cells."""
     robot_offset: float = 0.25
-    """Largest such offset of a robot in cells; towards a free cell it is up to half a cell, where a robot that left its
-    lane is held up by a peg. A policy that has not begun there presses on."""
+    """Largest such offset of a robot in cells; towards a free cell, or a box that it can push, it is up to half a cell,
+    where a robot that left its lane is held up by a peg. A policy that has not begun there presses on."""
     box_offset: float = 0.1
     """Largest such offset of a box, along one axis; across it it is less than half of that."""
     overshoot: float = 0.11

@@ -21,10 +21,10 @@ import torch
 from numpy.typing import NDArray
 
 from mujoban_controller.goal_features import goal_offsets, privileged_features
-from mujoban_controller.goal_rewards import GoalReward, fallen
+from mujoban_controller.goal_rewards import REACH, GoalReward, fallen
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.instructions import TerminationNoise, feasible_kinds, random_instruction
-from mujoban_core.grid import DIFFICULTIES, INSTRUCTION_LIMIT, OFFSETS_RC, OFFSETS_XY, Instruction
+from mujoban_core.grid import DIFFICULTIES, GRID_SIZE, INSTRUCTION_LIMIT, OFFSETS_RC, OFFSETS_XY, Instruction
 from mujoban_core.interfaces import ControllerInput, Planner, put_rows, take_rows
 from mujoban_rl.engine import State
 from mujoban_sim.driving import forward_speed
@@ -313,23 +313,41 @@ class GoalTask:
         config, rng, world = self.config, self._rng, self.world
         size, m, k = world.body.cell_size, len(rows), world.max_boxes
         pose = world.pose[rows].astype(np.float64)
-        pose[:, :2] += self._stray(rows) * size
         # A box that is off along both axes would overlap a peg.
         lopsided = np.where(rng.random((m, k, 1)) < 0.5, [[1.0, 0.4]], [[0.4, 1.0]])
-        boxes = world.box_position[rows] + rng.uniform(-1, 1, (m, k, 2)) * lopsided * config.box_offset * size
-        world.place(rows, pose, boxes)
+        stray, off = self._stray(rows, rng.uniform(-1, 1, (m, k, 2)) * lopsided * config.box_offset)
+        pose[:, :2] += stray * size
+        world.place(rows, pose, world.box_position[rows] + off * size)
 
-    def _stray(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return offsets of robots from the centres of their cells, in cells, [M, 2]: up to halfway to a free cell."""
+    def _stray(
+        self, rows: NDArray[np.int64], off: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return offsets of robots from the centres of their cells, and of boxes from theirs, [M, 2] and [M, K, 2].
+
+        A robot is up to halfway to a free cell, or to one of a box, which it then has pushed from where it was.
+
+        Args:
+            rows: int [M].
+            off: Offsets of boxes before, in cells as well, [M, K, 2].
+        """
         config, rng, world = self.config, self._rng, self.world
         heading = rng.integers(1, len(OFFSETS_XY), len(rows))
-        cell = world.agent_cell[rows] + OFFSETS_RC[heading]
-        boxed = (world.box_cell[rows] == cell[:, None]).all(-1).any(-1)
-        free = ~world.wall[rows, cell[:, 0], cell[:, 1]] & ~boxed
-        along = rng.uniform(0.0, np.where(free, 0.5, config.robot_offset))[:, None]
+        step = OFFSETS_RC[heading]
+        cell = world.agent_cell[rows] + step
+        ahead = (world.box_cell[rows] == cell[:, None]).all(-1)
+        open_ = np.where(ahead.any(-1), self._is_free(rows, cell + step), self._is_free(rows, cell))
+        along = rng.uniform(0.0, np.where(open_, 0.5, config.robot_offset))[:, None]
         across = rng.uniform(-config.robot_offset, config.robot_offset, (len(rows), 1))
         axis = OFFSETS_XY[heading]
-        return along * axis + across * np.stack([-axis[:, 1], axis[:, 0]], 1)
+        apart = 1.0 + (off * axis[:, None]).sum(-1) - along
+        pushed = (ahead * np.maximum(REACH - apart, 0.0))[..., None] * axis[:, None]
+        return along * axis + across * np.stack([-axis[:, 1], axis[:, 0]], 1), off + pushed
+
+    def _is_free(self, rows: NDArray[np.int64], cell: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell of which cells, [M, 2], one in each row, neither wall nor box is in the way."""
+        row, column = np.clip(cell, 0, GRID_SIZE - 1).T
+        boxed = (self.world.box_cell[rows] == cell[:, None]).all(-1).any(-1)
+        return ~self.world.wall[rows, row, column] & ~boxed
 
     def _issue(self, rows: NDArray[np.int64]) -> None:
         world = self.world

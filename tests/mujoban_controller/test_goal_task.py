@@ -18,7 +18,7 @@ from mujoban_controller.judge import failure_name, judge
 from mujoban_controller.scripted import scripted_driver
 from mujoban_controller.turning import judge_turning
 from mujoban_core.bodies import BALL
-from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction
+from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_XY, Instruction, cell_to_xy
 from mujoban_core.interfaces import Planner
 from mujoban_sim.goals import GoalKind
 from mujoban_sim.oracles import OracleController, OraclePlanner
@@ -109,6 +109,19 @@ def test_misaligned_starts_leave_nothing_in_collision():
     for _ in range(10):
         task.world.step(np.zeros((32, 2), np.float32))
     assert np.abs(task.world.box_position - start).max() < 0.02
+
+
+def test_some_misaligned_starts_are_amid_a_push_and_off_the_lane():
+    world = make(batch=128, difficulty=5, misaligned=1.0).world
+    off = world.pose[:, :2] - cell_to_xy(world.agent_cell)
+    apart = world.box_position - world.pose[:, None, :2]
+    axis = np.eye(2)[np.abs(off).argmax(1)] * np.sign(off)
+    along = (apart * axis[:, None]).sum(-1)
+    across = np.abs(apart - along[..., None] * axis[:, None]).max(-1)
+    ahead = (np.arange(world.max_boxes) < world.box_count[:, None]) & (along > 0) & (along < 0.75) & (across < 0.4)
+    amid = ahead.any(1) & (np.abs(off).max(1) > 0.35)
+    assert amid.sum() > 3 and (np.abs(off[amid]).min(1) > 0.1).any()
+    assert along[ahead].min() > 0.59, "no robot begins within a box"
 
 
 def test_the_same_seed_gives_the_same_task():
