@@ -24,7 +24,7 @@ from mujoban_controller.goal_features import goal_offsets, privileged_features
 from mujoban_controller.goal_rewards import REACH, GoalReward, fallen
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.instructions import TerminationNoise, feasible_kinds, random_instruction
-from mujoban_core.grid import DIFFICULTIES, GRID_SIZE, INSTRUCTION_LIMIT, OFFSETS_RC, OFFSETS_XY, Instruction
+from mujoban_core.grid import DIFFICULTIES, INSTRUCTION_LIMIT, OFFSETS_RC, OFFSETS_XY, Instruction
 from mujoban_core.interfaces import ControllerInput, Planner, put_rows, take_rows
 from mujoban_rl.engine import State
 from mujoban_sim.driving import forward_speed
@@ -332,22 +332,15 @@ class GoalTask:
         """
         config, rng, world = self.config, self._rng, self.world
         heading = rng.integers(1, len(OFFSETS_XY), len(rows))
-        step = OFFSETS_RC[heading]
-        cell = world.agent_cell[rows] + step
+        cell = world.agent_cell[rows] + OFFSETS_RC[heading]
         ahead = (world.box_cell[rows] == cell[:, None]).all(-1)
-        open_ = np.where(ahead.any(-1), self._is_free(rows, cell + step), self._is_free(rows, cell))
+        open_ = feasible_kinds(world)[rows, heading] != GoalKind.HOLD
         along = rng.uniform(0.0, np.where(open_, 0.5, config.robot_offset))[:, None]
         across = rng.uniform(-config.robot_offset, config.robot_offset, (len(rows), 1))
         axis = OFFSETS_XY[heading]
         apart = 1.0 + (off * axis[:, None]).sum(-1) - along
         pushed = (ahead * np.maximum(REACH - apart, 0.0))[..., None] * axis[:, None]
         return along * axis + across * np.stack([-axis[:, 1], axis[:, 0]], 1), off + pushed
-
-    def _is_free(self, rows: NDArray[np.int64], cell: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Tell of which cells, [M, 2], one in each row, neither wall nor box is in the way."""
-        row, column = np.clip(cell, 0, GRID_SIZE - 1).T
-        boxed = (self.world.box_cell[rows] == cell[:, None]).all(-1).any(-1)
-        return ~self.world.wall[rows, row, column] & ~boxed
 
     def _issue(self, rows: NDArray[np.int64]) -> None:
         world = self.world
