@@ -201,4 +201,6 @@ def test_a_probability_above_one_by_less_than_rounding_is_refused():
     with pytest.raises(ConversionError):
         conversions.termination_value(1, above, terminated=False)
     with pytest.raises(ConversionError):
+        conversions.termination_to_msg(header, conversions.TerminationReading(1, above, False, False))
+    with pytest.raises(ConversionError):
         conversions.abstract_state_to_msg(header, np.full((10, 10, 4), above))
