@@ -6,7 +6,7 @@ Shapes: B rows of the world, M <= B rows in which an episode is still running.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from mujoban_core.sense_plan_act import Decision
 from mujoban_core.trees import map_leaves
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
+
+if TYPE_CHECKING:
+    from mujoban_sim.rendering import CameraName
 
 Tree = TypeVar("Tree")
 
@@ -113,7 +116,8 @@ def ticks(
     issued = np.zeros(world.batch, np.bool_)
     while True:
         looking = policy.robots_looking(state) if asked else None
-        observation, truth = observe(world, rows, camera=camera, looking=looking), tell(world, rows, above=above)
+        observation = observe(world, rows, camera=camera, looking=looking)
+        truth = tell(world, rows, above=above, looking=looking)
         decision, state = policy.step(observation, truth, state)
         torque[:], issued[:] = 0.0, False
         torque[rows], instruction[rows], issued[rows] = decision.torque, decision.instruction, decision.issued
@@ -207,10 +211,15 @@ class Judge:
         return results
 
 
-def tell(world: World, rows: NDArray[np.int64], *, above: bool) -> GroundTruth:
-    """Return what only the simulator knows of the given rows, with the view from above where that is wanted."""
+def tell(
+    world: World, rows: NDArray[np.int64], *, above: bool, looking: NDArray[np.bool_] | None = None
+) -> GroundTruth:
+    """Return what only the simulator knows of the given rows, with the view from above where that is wanted.
+
+    That of robots that are not `looking`, [M], is black.
+    """
     truth = select(world.truth(), rows)
-    return truth._replace(top_down=world.render(TOP_DOWN_CAMERA, rows=rows)) if above else truth
+    return truth._replace(top_down=_view(world, TOP_DOWN_CAMERA, rows, looking)) if above else truth
 
 
 def observe(
@@ -220,12 +229,17 @@ def observe(
 
     Without `camera` the frames are empty, [M, 0, 0, 3]; of those that are not `looking`, [M], they are black.
     """
-    if not camera:
-        frame = np.zeros((len(rows), 0, 0, 3), np.uint8)
-    elif looking is None:
-        frame = world.render(FIRST_PERSON_CAMERA, rows=rows)
-    else:
-        frame = np.zeros((len(rows), FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
-        if looking.any():
-            frame[looking] = world.render(FIRST_PERSON_CAMERA, rows=rows[looking])
+    empty = np.zeros((len(rows), 0, 0, 3), np.uint8)
+    frame = _view(world, FIRST_PERSON_CAMERA, rows, looking) if camera else empty
     return Observation(frame, world.proprio[rows], world.pose[rows])
+
+
+def _view(
+    world: World, camera: CameraName, rows: NDArray[np.int64], looking: NDArray[np.bool_] | None
+) -> NDArray[np.uint8]:
+    if looking is None:
+        return world.render(camera, rows=rows)
+    frame = np.zeros((len(rows), FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+    if looking.any():
+        frame[looking] = world.render(camera, rows=rows[looking])
+    return frame

@@ -7,7 +7,7 @@ import torch
 from bringup.rollout import ticks
 from mujoban_baselines import load
 from mujoban_baselines.actor import AgentActor
-from mujoban_baselines.agents import MonolithicAgent
+from mujoban_baselines.agents import MonolithicAgent, TopDownAgent
 from mujoban_baselines.repeat import Repeating
 from mujoban_baselines.task import Task, TaskStep
 from mujoban_core.agent import Agent, AgentInput, AgentPolicy
@@ -69,14 +69,15 @@ def test_weights_are_played_as_they_were_trained(tmp_path):
         MonolithicAgent(repeat=0)
 
 
-def test_frames_that_nobody_looks_at_are_not_drawn(monkeypatch):
+@pytest.mark.parametrize(("kind", "camera"), [(MonolithicAgent, True), (TopDownAgent, False)])
+def test_frames_that_nobody_looks_at_are_not_drawn(kind, camera, monkeypatch):
     torch.manual_seed(0)
-    policy = AgentPolicy(Repeating(MonolithicAgent(repeat=4).eval(), 4, actuators=2))
+    policy = AgentPolicy(Repeating(kind(repeat=4).eval(), 4, actuators=2))
     render, drawn, played = World.render, [], []
     monkeypatch.setattr(World, "render", lambda *args, rows: drawn.append(len(rows)) or render(*args, rows=rows))
-    for camera in (None, True):
+    for first_person in (None, camera):
         world = World(2, max_boxes=1, time_limit=6)
-        told = [tick.decision.torque for tick in ticks(policy, world, Episodes(3, 20, difficulty=1), camera=camera)]
+        told = [tick.decision.torque for tick in ticks(policy, world, Episodes(3, 20, difficulty=1), camera=first_person)]
         played.append((np.concatenate(told), sum(drawn)))
         drawn.clear()
         world.close()
