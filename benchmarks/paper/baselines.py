@@ -30,8 +30,8 @@ from mujoban_rl.metrics import mean_of
 from mujoban_sim.presets import DEFAULT_WORLD
 
 PROG: Final = "benchmarks.paper.baselines"
-_MOST: Final = 100
-"""Points of a curve; more are averaged."""
+_MOST: Final = 20
+"""Points of a curve, each of which is to be the mean of many episodes; more are averaged."""
 _KINDS: Final = ("solved", "return")
 
 

@@ -13,6 +13,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
@@ -109,15 +110,22 @@ def baseline_curves(file: Path) -> bool:
     found = [(row, points) for row, points in rows if any(point["solved"] for point in points)]
     if not found:
         return False
-    figure, panels = plt.subplots(2, len(DIFFICULTIES), figsize=(14, 5), layout="constrained", sharex=True)
-    for (axes_solved, axes_return), d in zip(panels.T, DIFFICULTIES, strict=True):
-        for axes, kind in ((axes_solved, "solved"), (axes_return, "return")):
+    kinds = ("solved", "return")
+    figure, panels = plt.subplots(
+        2, len(DIFFICULTIES), figsize=(14, 5), layout="constrained", sharex=True, sharey="row", squeeze=False
+    )
+    for kind, line in zip(kinds, panels, strict=True):
+        for axes, d in zip(line, DIFFICULTIES, strict=True):
             for row, points in found:
-                seen = [(p["step"], p[kind][str(d)]) for p in points if str(d) in p[kind]]
-                if seen:
-                    axes.plot(*zip(*seen, strict=True), label=row.label)
-            axes.set(ylabel=kind, xlabel="environment steps")
-        axes_solved.set_title(f"difficulty {d}")
+                seen = [(p["step"] / 1e6, p[kind][str(d)]) for p in points if str(d) in p[kind]]
+                axes.plot(*np.reshape(seen, (-1, 2)).T, marker=".", markersize=4, label=row.label)
+            axes.grid(alpha=0.3)
+        line[0].set(ylabel=kind, ylim=(0.0, None))
+    for axes, d in zip(panels[0], DIFFICULTIES, strict=True):
+        axes.set_title(f"difficulty {d}")
+        axes.yaxis.set_major_formatter(lambda y, _: f"{100 * y:.4g} %")
+    for axes in panels[1]:
+        axes.set_xlabel("million environment steps")
     handles = {name: h for axes in panels.flat for h, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize="small")
     figure.savefig(file, dpi=110)
