@@ -9,6 +9,7 @@ from typing import Any, Final, TypeVar
 
 from mujoban_controller.judge import judge
 from mujoban_controller.policy import GoalPolicy
+from mujoban_core.stats import rate_error
 from mujoban_rl.best import JudgedLearner, judged
 from mujoban_rl.engine import Scalars
 from mujoban_rl.run_directory import RunDirectory
@@ -35,8 +36,8 @@ class Validation:
 class ProductLearner(JudgedLearner[BatchT]):
     """A learner whose product is a controller or a teacher.
 
-    Late checkpoints differ by more than training improves them, so what is exported is the product that has solved
-    the most validation levels.
+    Late checkpoints differ by more than training improves them, so what is exported is the newest of the products that
+    have solved the most validation levels, or fewer by no more than chance.
     """
 
     def __init__(self, validation: Validation) -> None:
@@ -60,11 +61,12 @@ class ProductLearner(JudgedLearner[BatchT]):
                 body=where.body, difficulty=where.difficulty, world=where.world, batch=128, threads=where.threads,
             )  # fmt: skip
         feasible = report["instructions"]["feasible"]
-        score = (report["success_rate"], feasible["completed"] / max(feasible["n"], 1))
+        counts = ((where.episodes - len(report["lost"]), where.episodes), (feasible["completed"], feasible["n"]))
+        score = tuple(succeeded / max(n, 1) for succeeded, n in counts)
         kinds = report["instructions"]["kinds"]
         medians = {f"steps/{k}": v["median_steps"] for k, v in kinds.items() if v["median_steps"] is not None}
         scalars = {**dict(zip(_RATES, score, strict=True)), "steps": report["median_steps"], **medians}
-        self.best.judge(product, score, scalars)
+        self.best.judge(product, score, scalars, tuple(rate_error(*count) for count in counts))
         return scalars
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:

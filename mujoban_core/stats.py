@@ -29,3 +29,14 @@ def wilson_interval(successes: int, n: int, z: float = 1.959963984540054) -> tup
     half = scale * z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     # Rounding must not exclude the rate itself at 0 and 1.
     return max(0.0, min(centre - half, rate)), min(1.0, max(centre + half, rate))
+
+
+def rate_error(successes: int, n: int) -> float:
+    """Return the standard error of a success rate, by the rule of succession: where all succeed it is not 0.
+
+    Args:
+        successes: Number of successes, 0 <= successes <= n.
+        n: Number of trials.
+    """
+    expected = (successes + 1) / (n + 2)
+    return math.sqrt(expected * (1.0 - expected) / (n + 2))

@@ -16,6 +16,7 @@ from mujoban_rl.weights import save_weights
 
 BatchT = TypeVar("BatchT")
 ProductT = TypeVar("ProductT", bound=nn.Module)
+Score = tuple[float, ...]
 
 
 class Best:
@@ -23,25 +24,32 @@ class Best:
 
     def __init__(self) -> None:
         """Know none yet."""
-        self._score: tuple[float, ...] | None = None
+        self._score: Score | None = None
+        self._errors: Score = ()
         self._weights: dict[str, Tensor] = {}
         self._scalars: Scalars = {}
         self._at: int | None = None
         self._judged = 0
 
-    def judge(self, product: nn.Module, score: tuple[float, ...], scalars: Scalars) -> None:
+    def judge(self, product: nn.Module, score: Score, scalars: Scalars, errors: Score | None = None) -> None:
         """Keep a product unless an earlier one has scored more, or its score is not a number.
 
         Args:
             product: As it is now.
             score: What products are compared by, in this order; the newest of equal ones is kept.
             scalars: What the evaluation found.
+            errors: The standard error of each entry. Entries that differ by no more than that of their difference count
+                as equal: of a product that fails never in a few levels, chance would let no later one take the place.
         """
+        errors = (0.0,) * len(score) if errors is None else errors
         # Nothing is more than one that is not a number: once kept, it would stay.
-        sound = not any(map(math.isnan, score))
-        if sound and (self._score is None or score >= self._score):
-            self._score, self._scalars, self._at = score, scalars, self._judged
-            self._weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
+        if not any(map(math.isnan, score)):
+            if self._score is None or not _is_less(score, self._score, errors, self._errors):
+                self._scalars, self._at = scalars, self._judged
+                self._weights = {k: v.detach().clone() for k, v in product.state_dict().items()}
+            if self._score is None or score >= self._score:
+                # Later ones are compared with the most that was ever scored, lest each be a little less than the last.
+                self._score, self._errors = score, errors
         self._judged += 1
 
     def chosen(self, product: ProductT) -> ProductT:
@@ -62,15 +70,27 @@ class Best:
     def state(self) -> State:
         """Return all of it."""
         score = None if self._score is None else list(self._score)
-        found = {"score": score, "scalars": self._scalars, "at": self._at, "evaluations": self._judged}
+        found = {
+            "score": score, "errors": list(self._errors), "scalars": self._scalars, "at": self._at,
+            "evaluations": self._judged,
+        }  # fmt: skip
         return State(found, self._weights)
 
     def restore(self, state: State) -> None:
         """Take over what `state` returned."""
         score = state.values["score"]
         self._score = None if score is None else tuple(score)
+        self._errors = tuple(state.values.get("errors", (0.0,) * len(score or ())))
         self._weights, self._scalars = state.tensors, state.values["scalars"]
         self._at, self._judged = state.values["at"], state.values["evaluations"]
+
+
+def _is_less(score: Score, other: Score, errors: Score, others: Score) -> bool:
+    """Return whether the first entry that differs by more than chance is less than the other's."""
+    for mine, its, *both in zip(score, other, errors, others, strict=True):
+        if abs(mine - its) > math.hypot(*both):
+            return mine < its
+    return False
 
 
 @contextmanager

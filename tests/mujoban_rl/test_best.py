@@ -3,6 +3,7 @@ import math
 import torch
 from torch import nn
 
+from mujoban_core.stats import rate_error
 from mujoban_rl.best import Best
 
 
@@ -21,6 +22,21 @@ def test_the_newest_of_the_best_is_kept_with_what_was_found():
     again.judge(product(9.0), (0.0, 1.0), {})
     assert again.chosen(product(8.0)).weight.item() == 2.0
     assert again.told == {"validation": {"rate": 0.7}, "evaluation": 2}
+
+
+def test_a_product_that_scores_less_by_no_more_than_chance_takes_the_place():
+    best = Best()
+    levels, instructions = 64, 2000
+    failed = [(0, 0), (0, 1), (1, 0), (0, 3), (3, 0), (2, 2)]
+    for value, (lost, missed) in enumerate(failed):
+        counts = ((levels - lost, levels), (instructions - missed, instructions))
+        errors = tuple(rate_error(*count) for count in counts)
+        best.judge(product(float(value)), tuple(k / n for k, n in counts), {}, errors)
+        again = Best()
+        again.restore(best.state())
+        best = again
+    # One failure may be chance, two or three are not, and the newest is compared with the best, not with the last kept.
+    assert best.told["evaluation"] == 2 and best.chosen(product(8.0)).weight.item() == 2.0
 
 
 def test_what_is_kept_does_not_change_with_the_product():
