@@ -300,7 +300,7 @@ def make_trainer(options: Options) -> Trainer[Any]:
     cadence = Cadence(
         log_updates=20 if on_policy else 200, publish_updates=1 if on_policy else 10,
         evaluate_samples=options.evaluate_every, save_seconds=options.save_every,
-        # What such a run makes is what has solved most, and that may be what it begins with.
+        # What such a run begins with is what it makes if nothing later solves as much.
         evaluate_first=config.initial is not None,
     )  # fmt: skip
     budget = Budget(samples=config.steps, cpu_seconds=config.cpu_seconds, seconds=config.horizon_seconds)
