@@ -75,9 +75,9 @@ def test_frames_that_nobody_looks_at_are_not_drawn(kind, camera, monkeypatch):
     policy = AgentPolicy(Repeating(kind(repeat=4).eval(), 4, actuators=2))
     render, drawn, played = World.render, [], []
     monkeypatch.setattr(World, "render", lambda *args, rows: drawn.append(len(rows)) or render(*args, rows=rows))
-    for first_person in (None, camera):
+    for drawing in (None, camera):
         world = World(2, max_boxes=1, time_limit=6)
-        told = [tick.decision.torque for tick in ticks(policy, world, Episodes(3, 20, difficulty=1), camera=first_person)]
+        told = [tick.decision.torque for tick in ticks(policy, world, Episodes(3, 20, difficulty=1), camera=drawing)]
         played.append((np.concatenate(told), sum(drawn)))
         drawn.clear()
         world.close()
