@@ -91,6 +91,8 @@ _STUDENT: Final = (
 """The student sees more of instructions that failed before, and of STAYs, which the stack asks for often; what it is to
 do under pushes that are not possible weighs less, so that it tries those where it can't tell."""
 _TEACHER: Final = ("--algorithm", "mpo")
+_FREED: Final = ("--mpo.steady", "0.25", "--task.retry", "0.25")
+"""And, once it drives, in part without noise, and more of what fails then: noise frees robots that pegs hold up."""
 _TURNING_TEACHER: Final = (
     "--algorithm", "ppo", "--task.planned", "0.7", "--task.retry", "0.25",
     "--task.instructions.stay", "0.2", "--task.instructions.stays-on", "0.985", "--task.reward.heading", "0.15",
@@ -236,6 +238,7 @@ def _controller(options: Options) -> list[Stage]:
     common += ("--steps", str(_STEPS), "--evaluate-every", str(every), "--evaluation-episodes", str(judged))
     train, body = "mujoban_controller.train", get_body(options.physics.body)
     method = _TEACHER if options.has_critic else _TURNING_TEACHER
+    method += _FREED if options.has_critic and options.before is not None else ()
     made = {"--initial": "teacher"} | ({"--critic": "critic"} if options.has_critic else {})
     begun = [x for option, product in made.items() for x in _from_before(options, option, product)]
     taught = ("--critic", str(run / PRODUCTS["critic"])) if options.has_critic else ()

@@ -63,6 +63,9 @@ class MPOTrainingConfig:
     explore: float = 0.0
     """Least standard deviation of the torques of every third robot: without it a policy that is sure of itself shows
     the critic nothing else."""
+    steady: float = 0.0
+    """Share of robots that play by the mean torques, as the product does. A robot that is held up by a peg is freed by
+    noise, by steady torques it may never be: such places are learned from where they are played."""
     average: float = 0.0
     """Decay of a moving average of the policy, which then acts, is the reference of the trust region, and is what the
     run makes; 0: the policy itself. Updates from few windows at a constant rate leave noise in a large network."""
@@ -79,7 +82,7 @@ class MPOTrainingConfig:
         """Reject numbers with which nothing is learned, and windows that hold no n-step return or no sequence holds."""
         check_counts(self, "windows", "replay", "n_step", "target_period")
         check_counts(self, "first", "critic_first", "normalised", least=0)
-        check_shares(self, "gamma", "average")
+        check_shares(self, "gamma", "average", "steady")
         check_positive(self, "gamma", "reuse", "policy_rate", "critic_rate", "clip")
         check_not_negative(self, "explore")
         if self.sequence < self.window:

@@ -81,9 +81,12 @@ class TaskPlayer(Player):
 class PrivilegedPlayer(TaskPlayer):
     """A privileged policy that explores."""
 
-    def __init__(self, task: GoalTask, policy: PrivilegedPolicy, generator: torch.Generator) -> None:
-        """Play with a copy of `policy` and noise from `generator`."""
+    def __init__(
+        self, task: GoalTask, policy: PrivilegedPolicy, generator: torch.Generator, steady: float = 0.0
+    ) -> None:
+        """Play with a copy of `policy` and noise from `generator`, a share of the robots `steady`, without."""
         self.task, self._generator = task, generator
+        self._steady = steady_rows(task.world.batch, steady)[:, None]
         self._policy = PrivilegedPolicy(**policy.config)
         self._features: NDArray[np.float32] = task.features()
 
@@ -91,7 +94,9 @@ class PrivilegedPlayer(TaskPlayer):
     def tick(self) -> tuple[Fields, Sequence[Outcome]]:
         """Play one tick."""
         features = self._features
-        action = self._policy(torch.from_numpy(features)).sample(self._generator).clamp(-1.0, 1.0).numpy()
+        drawn = self._policy(torch.from_numpy(features))
+        torque = torch.where(self._steady, drawn.mean, drawn.sample(self._generator))
+        action = torque.clamp(-1.0, 1.0).numpy()
         result = self.task.step(action)
         self._features = self.task.features()
         kept = {"features": features, "action": action, **_outcome(result)}
@@ -168,24 +173,39 @@ class ExploringPlayer(CameraPlayer):
     """A camera policy that draws its torques, for MPO with an asymmetric critic."""
 
     def __init__(
-        self, task: GoalTask, policy: VisuomotorController, generator: torch.Generator, explore: float = 0.0
-    ) -> None:
-        """Play with a copy of `policy`; the torques of every third robot deviate by `explore` at least."""
+        self, task: GoalTask, policy: VisuomotorController, generator: torch.Generator, explore: float = 0.0,
+        steady: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Play with a copy of `policy`; the torques of every third robot deviate by `explore` at least.
+
+        A share of the robots is `steady`: theirs do not deviate.
+        """
         super().__init__(task, policy, generator)
         self._explore = explore
+        self._steady = steady_rows(task.world.batch, steady)[:, None]
 
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
+        scale = scale.masked_fill(self._steady, 0.0)
         torque = drawn_torque(mean, scale, self._explore, self.generator)
         seen = {"features": self.task.features(), "action": torque}
         return torque, {**seen, "mean": mean.numpy(), "scale": scale.numpy()}
 
 
+def steady_rows(batch: int, share: float) -> Tensor:
+    """Return which of so many robots play by the mean of their policy, bool [B]: about that share of them."""
+    count = torch.arange(batch + 1, dtype=torch.float64) * share
+    return count.floor().diff() > 0.0
+
+
 def drawn_torque(
     mean: Tensor, scale: Tensor, explore: float, generator: torch.Generator
 ) -> NDArray[np.float32]:
-    """Return torques that are drawn, limited to [-1, 1], [B, U]; of every third robot with `explore` at least."""
+    """Return torques that are drawn, limited to [-1, 1], [B, U]; of every third robot with `explore` at least.
+
+    Where `scale` is 0 they are the mean.
+    """
     third = torch.arange(len(mean)) % 3 == 0
-    least = torch.where(third, explore, 0.0)[:, None]
+    least = torch.where(third[:, None] & (scale > 0.0), explore, 0.0)
     noise = torch.randn(mean.shape, generator=generator)
     return (mean + torch.maximum(scale, least) * noise).clamp(-1.0, 1.0).numpy()
 

@@ -185,7 +185,8 @@ class _Parts:
     def _mpo(self) -> tuple[Learner[Any], Source[Any]]:
         config, policy = self.config, self._privileged(0.6)
         learner = self._learner(policy, config.mpo)
-        return learner, self._replay(PrivilegedPlayer(self.task, policy, self.generator()), config.mpo)
+        player = PrivilegedPlayer(self.task, policy, self.generator(), config.mpo.steady)
+        return learner, self._replay(player, config.mpo)
 
     def _asymmetric(self) -> tuple[Learner[Any], Source[Any]]:
         config, policy = self.config, self._camera()
@@ -194,7 +195,8 @@ class _Parts:
         learner = self._learner(policy, config.asymmetric)
 
         def player() -> Player:
-            return ExploringPlayer(self.task, policy, self.generator(), config.asymmetric.explore)
+            explore, steady = config.asymmetric.explore, config.asymmetric.steady
+            return ExploringPlayer(self.task, policy, self.generator(), explore, steady)
 
         return learner, self._replay_with_bags(player, policy, config.asymmetric)
 

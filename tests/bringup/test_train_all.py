@@ -71,6 +71,7 @@ def test_a_continued_run_takes_every_module_from_the_one_before(tmp_path: Path) 
         ("controller_distil", "--initial", "controller"), ("planner", "--init", "planner"),
     ):  # fmt: skip
         assert found[name][found[name].index(option) + 1] == str(before / PRODUCTS[product])
+    assert found["teacher"][found["teacher"].index("--mpo.steady") + 1] == "0.25"
     first = found["estimator_first"]
     assert first[first.index("--start") + 1] == str((before / PRODUCTS["estimator"]).parent)
     assert str(before / PRODUCTS["first"]) in first and str(before / PRODUCTS["second"]) in found["estimator_second"]

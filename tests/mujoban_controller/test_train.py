@@ -42,7 +42,9 @@ STAGES = {
     "asymmetric": TrainConfig(stage="mpo", task=TASK, network=NETWORK, asymmetric=AsymmetricConfig(**MPO, average=0.9)),
     "critic beside": TrainConfig(
         stage="mpo", task=TASK, network=NETWORK,
-        asymmetric=AsymmetricConfig(**MPO, critic_updates=2, critic_windows=3, critic_replay=64, critic_first=2),
+        asymmetric=AsymmetricConfig(
+            **MPO, critic_updates=2, critic_windows=3, critic_replay=64, critic_first=2, steady=0.5
+        ),
     ),
     "distil": TrainConfig(stage="distil", teacher=Path("teacher"), task=TASK, network=NETWORK, distil=DISTIL),
 }
@@ -56,6 +58,7 @@ STAGES = {
         (PPOTrainingConfig, "gamma", 1.5, "a share"),
         (PPOTrainingConfig, "least_rate", 0.1, "at most largest_rate"),
         (MPOTrainingConfig, "policy_rate", 0.0, "a number above 0"),
+        (MPOTrainingConfig, "steady", 1.5, "a share"),
         (AsymmetricConfig, "critic_windows", 0, "at least 1"),
         (GoalTaskConfig, "astray", math.nan, "a share"),
         (InstructionConfig, "push", -0.1, "a share"),

@@ -1,0 +1,43 @@
+"""Players: some robots of a training act as the product will, without noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from mujoban_controller.controller import VisuomotorController
+from mujoban_controller.episodes import SeededEpisodes
+from mujoban_controller.goal_settings import GoalTaskConfig
+from mujoban_controller.goal_task import GoalTask
+from mujoban_controller.play import ExploringPlayer, PrivilegedPlayer
+from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_sim.oracles import OraclePlanner
+
+
+@pytest.fixture
+def task():
+    config = GoalTaskConfig(batch=4, difficulty=1)
+    task = GoalTask(config, OraclePlanner(), SeededEpisodes(1, 5_000_000), np.random.default_rng(0))
+    yield task
+    task.world.close()
+
+
+def by_the_mean(action, mean):
+    return (np.abs(action - np.clip(mean, -1, 1)) < 1e-6).all(-1).tolist()
+
+
+def test_steady_robots_of_a_teacher_play_by_the_mean(task):
+    policy = PrivilegedPolicy("ball", scale=0.4)
+    player = PrivilegedPlayer(task, policy, torch.Generator().manual_seed(0), steady=0.5)
+    player.take(policy.state_dict())
+    kept, _ = player.tick()
+    assert by_the_mean(kept["action"], policy.act(kept["features"])) == [False, True, False, True]
+
+
+def test_steady_robots_of_a_camera_policy_do_not_explore_and_their_values_are_those_of_the_mean(task):
+    policy = VisuomotorController("ball", channels=(8, 8, 8), features=16, hidden=8)
+    player = ExploringPlayer(task, policy, torch.Generator().manual_seed(0), explore=0.5, steady=0.5)
+    kept, _ = player.tick()
+    assert by_the_mean(kept["action"], kept["mean"]) == [False, True, False, True]
+    assert (kept["scale"] > 0).all(-1).tolist() == [True, False, True, False]
