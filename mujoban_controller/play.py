@@ -84,7 +84,7 @@ class PrivilegedPlayer(TaskPlayer):
     def __init__(
         self, task: GoalTask, policy: PrivilegedPolicy, generator: torch.Generator, steady: float = 0.0
     ) -> None:
-        """Play with a copy of `policy` and noise from `generator`, a share of the robots `steady`, without."""
+        """Play with a copy of `policy` and noise from `generator`; a share `steady` of the robots has none."""
         self.task, self._generator = task, generator
         self._steady = steady_rows(task.world.batch, steady)[:, None]
         self._policy = PrivilegedPolicy(**policy.config)

@@ -39,7 +39,7 @@ class Best:
             score: What products are compared by, in this order; the newest of equal ones is kept.
             scalars: What the evaluation found.
             errors: The standard error of each entry. Entries that differ by no more than that of their difference count
-                as equal: of a product that fails never in a few levels, chance would let no later one take the place.
+                as equal: else no later product takes the place of one that by chance failed in none of a few levels.
         """
         errors = (0.0,) * len(score) if errors is None else errors
         # Nothing is more than one that is not a number: once kept, it would stay.
@@ -80,6 +80,7 @@ class Best:
         """Take over what `state` returned."""
         score = state.values["score"]
         self._score = None if score is None else tuple(score)
+        # Checkpoints of earlier versions have none.
         self._errors = tuple(state.values.get("errors", (0.0,) * len(score or ())))
         self._weights, self._scalars = state.tensors, state.values["scalars"]
         self._at, self._judged = state.values["at"], state.values["evaluations"]
