@@ -90,7 +90,7 @@ class JointActor(Actor):
         for network in networks:
             network.eval()
         planner = DrawingPlanner(networks.planner, self._generator)
-        controller = DrawingController(networks.controller, self._generator, own.explore)
+        controller = DrawingController(networks.controller, self._generator, own.explore, own.steady)
         looking = [look_around(module, turn, body=body) for module in (planner, controller)]
         # The controller of a body that no single action turns does so itself, and learns it like all else.
         self._turns = isinstance(looking[1], LookAroundController)

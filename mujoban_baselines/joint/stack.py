@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from mujoban_controller.controller import Recurrent, VisuomotorController
-from mujoban_controller.play import drawn_torque
+from mujoban_controller.play import drawn_torque, steady_rows
 from mujoban_core.interfaces import Controller, ControllerInput, Memory, Planner
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state
 
@@ -39,11 +39,16 @@ class DrawingPlanner(Planner):
 
 
 class DrawingController(Controller):
-    """Draws torques from the distribution of a network; those of every third robot deviate by `explore` at least."""
+    """Draws torques from the distribution of a network; those of every third robot deviate by `explore` at least.
 
-    def __init__(self, network: VisuomotorController, generator: torch.Generator, explore: float) -> None:
+    Those of a share of the robots are `steady`: the mean.
+    """
+
+    def __init__(
+        self, network: VisuomotorController, generator: torch.Generator, explore: float, steady: float = 0.0
+    ) -> None:
         """Draw with `generator`."""
-        self.network, self._generator, self._explore = network, generator, explore
+        self.network, self._generator, self._explore, self._steady = network, generator, explore, steady
 
     def initial_memory(self, batch: int) -> Memory:
         """Return the network's."""
@@ -54,4 +59,5 @@ class DrawingController(Controller):
         """Return torques limited to [-1, 1], [B, U], and the next memory."""
         output = self.network(*self.network.to_tensors(inputs), memory=Recurrent(*state))
         mean, scale = output.action.mean[:, 0], output.action.scale[:, 0]
+        scale = scale.masked_fill(steady_rows(len(scale), self._steady)[:, None], 0.0)
         return drawn_torque(mean, scale, self._explore, self._generator), output.memory

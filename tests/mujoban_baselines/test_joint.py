@@ -27,6 +27,7 @@ from mujoban_rl.testing import check_refusal, check_resuming
 TASK = TaskConfig(levels="easy", robots=2, episode_seconds=2.4)
 CONTROLLER = MPOTrainingConfig(
     window=4, windows=2, sequence=4, replay=60, first=80, reuse=2.0, n_step=1, samples=2, target_period=2, explore=0.2,
+    steady=0.5,
 )  # fmt: skip
 SMALL = JointSettings(
     look_around=0, controller=CONTROLLER, planner=PlannerSettings(batch=3, replay=20, n_step=1, critic_first=1)

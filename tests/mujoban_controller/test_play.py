@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from mujoban_controller.controller import VisuomotorController
+from mujoban_baselines.joint.stack import DrawingController
+from mujoban_controller.controller import Recurrent, VisuomotorController
 from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import GoalTask
@@ -41,3 +42,12 @@ def test_steady_robots_of_a_camera_policy_do_not_explore_and_their_values_are_th
     kept, _ = player.tick()
     assert by_the_mean(kept["action"], kept["mean"]) == [False, True, False, True]
     assert (kept["scale"] > 0).all(-1).tolist() == [True, False, True, False]
+
+
+def test_steady_robots_of_a_stack_that_is_fine_tuned_play_by_the_mean(task):
+    network, inputs = VisuomotorController("ball", channels=(8, 8, 8), features=16, hidden=8), task.observe()
+    controller = DrawingController(network, torch.Generator().manual_seed(0), explore=0.5, steady=0.5)
+    torque, _ = controller.step(inputs, controller.initial_memory(4))
+    with torch.no_grad():
+        output = network(*network.to_tensors(inputs), memory=Recurrent(*network.initial_memory(4)))
+    assert by_the_mean(torque, output.action.mean[:, 0].numpy()) == [False, True, False, True]
