@@ -112,7 +112,7 @@ def baseline_curves(file: Path) -> bool:
         return False
     kinds = ("solved", "return")
     figure, panels = plt.subplots(
-        2, len(DIFFICULTIES), figsize=(14, 5), layout="constrained", sharex=True, sharey="row", squeeze=False
+        2, len(DIFFICULTIES), figsize=(14, 5), layout="constrained", sharex=True, sharey="row"
     )
     for kind, line in zip(kinds, panels, strict=True):
         for axes, d in zip(line, DIFFICULTIES, strict=True):
