@@ -4,7 +4,7 @@
     python -m benchmarks.paper.runs --only mpo_easy_1 mpo_easy_5                  # evaluate its weights
 
 The first writes `baseline_<name>.jsonl`, an object a line with `step`, `cpu_seconds`, `seconds` of wall-clock, and
-`solved` and `return` of the episodes that were played in training, by difficulty.
+`solved` and `return` of the episodes that were played in training and their number, `episodes`, by difficulty.
 """
 
 from __future__ import annotations
@@ -26,13 +26,17 @@ from mujoban_core.files import write_atomically
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import ROLES
 from mujoban_core.program import read_options, run_command
-from mujoban_rl.metrics import mean_of
+from mujoban_rl.metrics import COUNT, mean_of
 from mujoban_sim.presets import DEFAULT_WORLD
 
 PROG: Final = "benchmarks.paper.baselines"
 _MOST: Final = 20
 """Points of a curve, each of which is to be the mean of many episodes; more are averaged."""
-_KINDS: Final = ("solved", "return")
+KINDS: Final = ("solved", "return")
+"""What a curve tells of the episodes of each difficulty, in the mean."""
+_EPISODES: Final = "episodes"
+_ENOUGH: Final = 20
+"""Episodes of which a point of a drawn curve is the mean, at least: the first to end are the short, solved ones."""
 
 
 HOURS: Final = 1.0
@@ -205,18 +209,42 @@ def read_curve(run: Path, *, cloned: bool = False) -> list[dict[str, Any]]:
         ResultError: If it, or such a cloning, has no metrics.
     """
     if (run / "pipeline.json").exists():
-        return [cost(run) | {kind: {} for kind in _KINDS}]
+        return [cost(run) | {kind: {} for kind in (*KINDS, _EPISODES)}]
     lines = _lines(run)
     before = _lines(run.with_name(run.name + _START))[-1] if cloned else {}
     points = []
     for part in np.array_split(np.array(lines, object), min(len(lines), _MOST)):
         spent = ("step", "cpu_seconds", "seconds")
         point: dict[str, Any] = {kind: round((part[-1].get(kind) or 0) + before.get(kind, 0)) for kind in spent}
-        for kind in _KINDS:
+        for kind in KINDS:
             means = {str(d): mean_of(part, [f"{kind}/{d}"]) for d in DIFFICULTIES}
             point[kind] = {d: round(mean[0], 4) for d, mean in means.items() if mean is not None}
-        points.append(point)
+        counts = {str(d): sum(line.get(f"{KINDS[0]}/{d}{COUNT}", 0.0) for line in part) for d in DIFFICULTIES}
+        points.append(point | {_EPISODES: {d: round(count) for d, count in counts.items() if count}})
     return points
+
+
+def joined(points: Sequence[dict[str, Any]], kind: str, difficulty: int) -> list[tuple[int, float]]:
+    """Return steps and means of a curve for a difficulty, points of few episodes joined with those that follow.
+
+    Episodes at the end that are too few for a point are left out.
+
+    Args:
+        points: As `points_of` returns them.
+        kind: One of `KINDS`.
+        difficulty: 1 to 5.
+    """
+    d = str(difficulty)
+    curve: list[tuple[int, float]] = []
+    total = episodes = 0
+    for point in points:
+        count = point[_EPISODES].get(d, 0)
+        total += count * point[kind].get(d, 0.0)
+        episodes += count
+        if episodes >= _ENOUGH:
+            curve.append((point["step"], total / episodes))
+            total = episodes = 0
+    return curve
 
 
 def _lines(run: Path) -> list[dict[str, Any]]:
@@ -235,7 +263,7 @@ def points_of(baseline: Baseline) -> list[dict[str, Any]]:
         return []
     try:
         points = [json.loads(line) for line in baseline.curve.read_text().splitlines()]
-        if any({"step", "cpu_seconds", "seconds", *_KINDS} - point.keys() for point in points):
+        if any({"step", "cpu_seconds", "seconds", *KINDS, _EPISODES} - point.keys() for point in points):
             raise ValueError("a point lacks a value")
     except ValueError as error:
         again = f"python -m {PROG} {baseline.name}=runs/baselines/{baseline.name}"

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.paper import runs as sources
-from benchmarks.paper.baselines import AGAIN, BASELINES, points_of
+from benchmarks.paper.baselines import AGAIN, BASELINES, KINDS, joined, points_of
 from benchmarks.paper.curves import MODULES
 from benchmarks.paper.runs import ResultError, Run, is_stale, load
 from mujoban_core.grid import DIFFICULTIES
@@ -110,15 +110,14 @@ def baseline_curves(file: Path) -> bool:
     found = [(row, points) for row, points in rows if any(point["solved"] for point in points)]
     if not found:
         return False
-    kinds = ("solved", "return")
     figure, panels = plt.subplots(
-        2, len(DIFFICULTIES), figsize=(14, 5), layout="constrained", sharex=True, sharey="row"
+        len(KINDS), len(DIFFICULTIES), figsize=(14, 5), layout="constrained", sharex=True, sharey="row"
     )
-    for kind, line in zip(kinds, panels, strict=True):
+    for kind, line in zip(KINDS, panels, strict=True):
         for axes, d in zip(line, DIFFICULTIES, strict=True):
             for row, points in found:
-                seen = [(p["step"] / 1e6, p[kind][str(d)]) for p in points if str(d) in p[kind]]
-                axes.plot(*np.reshape(seen, (-1, 2)).T, marker=".", markersize=4, label=row.label)
+                steps, means = np.reshape(joined(points, kind, d), (-1, 2)).T
+                axes.plot(steps / 1e6, means, marker=".", markersize=4, label=row.label)
             axes.grid(alpha=0.3)
         line[0].set(ylabel=kind, ylim=(0.0, None))
     for axes, d in zip(panels[0], DIFFICULTIES, strict=True):

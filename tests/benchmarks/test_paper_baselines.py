@@ -24,7 +24,9 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, mo
     assert baselines.main([f"mpo_easy={tmp_path / 'run'}"]) == 0
     row = next(row for row in baselines.BASELINES if row.name == "mpo_easy")
     cost = {"step": 10_000, "cpu_seconds": 3600, "seconds": 1800}
-    assert baselines.points_of(row)[-1] == {**cost, "solved": {"1": 1.0}, "return": {"1": 10.0}}
+    assert baselines.points_of(row)[-1] == {
+        **cost, "solved": {"1": 1.0}, "return": {"1": 10.0}, "episodes": {"1": 1},
+    }  # fmt: skip
     monkeypatch.setattr(baselines, "ROOT", tmp_path)  # whoever has trained the agent has other weights there
     monkeypatch.setattr(baselines, "_MOST", 5)  # lines 9 and 10 are of 2 episodes and of 1
     assert baselines.read_curve(tmp_path / "run")[-1]["solved"] == {"1": 0.9333}
@@ -40,8 +42,16 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, mo
         results.rebuild(folder)
 
 
+def test_a_point_of_a_drawn_curve_is_of_many_episodes():
+    counts = ((100, 12, 1.0), (200, 8, 0.5), (300, 30, 0.1), (400, 19, 0.0))
+    points = [{"step": step, "solved": {"1": rate}, "episodes": {"1": n}} for step, n, rate in counts]
+    points.insert(1, {"step": 150, "solved": {}, "episodes": {}})  # none of difficulty 1 ended
+    assert baselines.joined(points, "solved", 1) == [(200, pytest.approx(0.8)), (300, pytest.approx(0.1))]
+    assert baselines.joined(points, "solved", 2) == []
+
+
 def test_the_modular_row_has_a_cost_and_no_curve(folder):
-    cost = {"step": 1_000_000, "cpu_seconds": 7200, "seconds": 3600, "solved": {}, "return": {}}
+    cost = {"step": 1_000_000, "cpu_seconds": 7200, "seconds": 3600, "solved": {}, "return": {}, "episodes": {}}
     baselines.MODULAR.curve.write_text(json.dumps(cost) + "\n")
     page = results.rebuild(folder).read_text()
     assert "| 1.00 M | 2.0 | 1.0 |" in page and "The curves of agents: not measured yet" in page
@@ -95,7 +105,7 @@ def test_table_1_has_a_floor_that_is_measured_without_a_training(folder, monkeyp
 
 def test_agents_get_the_steps_that_the_modular_row_took(folder):
     assert "--steps 1250000" in baselines.JOINT.commands[0]
-    taken = {"step": 1_300_000, "cpu_seconds": 7000, "seconds": 3500, "solved": {}, "return": {}}
+    taken = {"step": 1_300_000, "cpu_seconds": 7000, "seconds": 3500, "solved": {}, "return": {}, "episodes": {}}
     baselines.MODULAR.curve.write_text(json.dumps(taken))
     assert "--steps 1300000" in baselines.JOINT.commands[0]
 
@@ -120,7 +130,8 @@ def test_what_a_cloning_before_took_counts(folder, tmp_path):
 def test_another_seed_of_a_row_is_shown_where_it_was_measured(folder):
     assert "seed 1 |" not in results.rebuild(folder).read_text()
     again = next(row for row in baselines.AGAIN if row.name == "mpo_easy_seed1")
-    again.curve.write_text(json.dumps({"step": 5, "cpu_seconds": 1, "seconds": 1, "solved": {}, "return": {}}))
+    point = {"step": 5, "cpu_seconds": 1, "seconds": 1, "solved": {}, "return": {}, "episodes": {}}
+    again.curve.write_text(json.dumps(point))
     write(again.run(1), 3, 4, {})
     page = results.rebuild(folder).read_text()
     assert "| MPO, asym., seed 1 | o_cam, o_pr, o_pos | easy |" in page and "75.0 % (30.1 to 95.4)" in page
