@@ -82,10 +82,14 @@ class PrivilegedPlayer(TaskPlayer):
     """A privileged policy that explores."""
 
     def __init__(
-        self, task: GoalTask, policy: PrivilegedPolicy, generator: torch.Generator, steady: float = 0.0
-    ) -> None:
-        """Play with a copy of `policy` and noise from `generator`; a share `steady` of the robots has none."""
-        self.task, self._generator = task, generator
+        self, task: GoalTask, policy: PrivilegedPolicy, generator: torch.Generator, explore: float = 0.0,
+        steady: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Play with a copy of `policy` and noise from `generator`; the torques of every third robot deviate more.
+
+        By `explore` at least; those of a share of the robots, which is `steady`, do not deviate.
+        """
+        self.task, self._generator, self._explore = task, generator, explore
         self._steady = steady_rows(task.world.batch, steady)[:, None]
         self._policy = PrivilegedPolicy(**policy.config)
         self._features: NDArray[np.float32] = task.features()
@@ -95,8 +99,8 @@ class PrivilegedPlayer(TaskPlayer):
         """Play one tick."""
         features = self._features
         drawn = self._policy(torch.from_numpy(features))
-        torque = torch.where(self._steady, drawn.mean, drawn.sample(self._generator))
-        action = torque.clamp(-1.0, 1.0).numpy()
+        scale = drawn.scale.masked_fill(self._steady, 0.0)
+        action = drawn_torque(drawn.mean, scale, self._explore, self._generator)
         result = self.task.step(action)
         self._features = self.task.features()
         kept = {"features": features, "action": action, **_outcome(result)}

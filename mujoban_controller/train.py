@@ -185,7 +185,7 @@ class _Parts:
     def _mpo(self) -> tuple[Learner[Any], Source[Any]]:
         config, policy = self.config, self._privileged(0.6)
         learner = self._learner(policy, config.mpo)
-        player = PrivilegedPlayer(self.task, policy, self.generator(), config.mpo.steady)
+        player = PrivilegedPlayer(self.task, policy, self.generator(), config.mpo.explore, config.mpo.steady)
         return learner, self._replay(player, config.mpo)
 
     def _asymmetric(self) -> tuple[Learner[Any], Source[Any]]:

@@ -28,12 +28,13 @@ def by_the_mean(action, mean):
     return (np.abs(action - np.clip(mean, -1, 1)) < 1e-6).all(-1).tolist()
 
 
-def test_steady_robots_of_a_teacher_play_by_the_mean(task):
+def test_steady_robots_of_a_teacher_play_by_the_mean_and_every_third_explores(task):
     policy = PrivilegedPolicy("ball", scale=0.4)
-    player = PrivilegedPlayer(task, policy, torch.Generator().manual_seed(0), steady=0.5)
+    player = PrivilegedPlayer(task, policy, torch.Generator().manual_seed(0), explore=1e3, steady=0.5)
     player.take(policy.state_dict())
     kept, _ = player.tick()
     assert by_the_mean(kept["action"], policy.act(kept["features"])) == [False, True, False, True]
+    assert (np.abs(kept["action"]) == 1.0).all(-1).tolist() == [True, False, False, False]
 
 
 def test_steady_robots_of_a_camera_policy_do_not_explore_and_their_values_are_those_of_the_mean(task):
