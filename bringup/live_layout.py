@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -15,7 +15,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from bringup.overlay import COLOURS
 from bringup.view import ARROWS
-from mujoban_core.bodies import BODIES
 from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_RC
 from mujoban_core.grid import Instruction as Direction
 from mujoban_core.plugins import AGENT, PRIVILEGED, ROLES, is_privileged
@@ -132,12 +131,9 @@ def arrow(agent: tuple[float, float], direction: int) -> rr.Arrows2D | rr.Points
     )  # fmt: skip
 
 
-def torque_curves(size: int) -> rr.SeriesLines:
-    """Return colours and names of the torques, [U], of the body that has as many."""
-    names = next(
-        ([a.joint for a in body.actuators] for body in BODIES.values() if body.action_size == size),
-        [str(i + 1) for i in range(size)],
-    )
+def torque_curves(joints: Sequence[str], size: int) -> rr.SeriesLines:
+    """Return colours and names of the torques, [U]: the joints they act on, or numbers where these are not said."""
+    names = list(joints) if len(joints) == size else [str(i + 1) for i in range(size)]
     colours = [_PALETTE[i % len(_PALETTE)] for i in range(size)]
     return rr.SeriesLines(colors=colours, names=names, widths=[2.0] * size)
 

@@ -72,12 +72,26 @@ def test_standard_tools_see_the_layers_and_the_scene(play_graph):
     assert markers["robot"].type == Marker.ARROW
 
 
-def test_a_recording_of_the_live_view_holds_every_entity(play_graph, tmp_path):
+def test_the_live_view_names_torques_by_their_joints_whatever_the_body():
+    pytest.importorskip("rerun")
+    from bringup.live_layout import torque_curves
+
+    for joints, shown in ((("left", "right"), ["left", "right"]), ((), ["1", "2"])):
+        curves = torque_curves(joints, 2)
+        assert curves.names is not None and curves.names.as_arrow_array().to_pylist() == shown
+
+
+@pytest.mark.parametrize("body", ["ball", "ant"])
+def test_a_recording_of_the_live_view_holds_every_entity(
+    play_graph, oracles, ant_teacher, body, tmp_path
+):
     chunk = pytest.importorskip("rerun.chunk")
     from bringup.live import LiveNode
 
     file = tmp_path / "play.rrd"
-    graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
+    driver = {"controller": Choice("controller", weights=ant_teacher)} if body == "ant" else {}
+    stack = Stack(oracles.choices | driver, body=body)
+    graph = play_graph(stack, Episodes(1, 0, difficulty=1), time_limit=25)
     graph.graph.add(LiveNode(parameter_overrides=[Parameter("save", value=str(file))]))
     graph.finish()
     graph.__exit__(None, None, None)
