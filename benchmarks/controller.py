@@ -1,4 +1,4 @@
-"""How long a step of the controller takes, how fast it trains, and whether continuous MPO solves a known problem.
+"""How long a step of the controllers that ship takes, how fast they train, and whether MPO solves a known problem.
 
 ``python -m benchmarks.controller`` prints JSON; ``--pendulum-steps 20000`` adds Gymnasium's ``Pendulum-v1`` learned
 from scratch (solved: a mean return above -250). ``--random-steps 10000000`` drives robots at random over levels of
@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,11 +25,12 @@ from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor, nn
 
+import mujoban_controller
 from benchmarks.command import run_benchmark
 from benchmarks.timing import milliseconds
-from mujoban_controller import train
-from mujoban_controller.controller import VisuomotorController
+from mujoban_controller import camera_weights, train
 from mujoban_controller.train import TrainConfig, make_trainer
+from mujoban_core.bodies import BODIES
 from mujoban_core.grid import GRID_SIZE, xy_to_cell
 from mujoban_core.interfaces import ControllerInput
 from mujoban_core.signals import StopSignal
@@ -56,15 +58,17 @@ class Options:
     seed: int = 0
 
 
-def step_time(repeats: int) -> float:
-    """Return the time of one step of the policy with batch 1 in milliseconds."""
-    controller = VisuomotorController().eval()
-    rng = np.random.default_rng(0)
-    frame = rng.integers(0, 256, (1, 64, 64, 3), dtype=np.uint8)
-    proprio = np.zeros((1, controller.proprio_size), np.float32)
-    inputs = ControllerInput(np.array([1]), frame, proprio, np.array([False]))
-    memory = controller.initial_memory(1)
-    return milliseconds(lambda: controller.step(inputs, memory), repeats)
+def step_times(repeats: int) -> dict[str, float]:
+    """Return the times of one step of each policy that ships with batch 1 in milliseconds, as a graph and without."""
+    frame = np.random.default_rng(0).integers(0, 256, (1, 64, 64, 3), dtype=np.uint8)
+    times = {}
+    for body in BODIES.values():
+        inputs = ControllerInput(np.array([1]), frame, np.zeros((1, body.proprio_size), np.float32), np.array([False]))
+        for suffix, compiled in (("", True), ("_without_graph", False)):
+            controller = mujoban_controller.load(camera_weights(body.name), compiled=compiled)
+            step = partial(controller.step, inputs, controller.initial_memory(1))
+            times[f"controller_step_ms_{body.name}{suffix}"] = milliseconds(step, repeats)
+    return times
 
 
 def training_rates(rounds: int) -> dict[str, float]:
@@ -253,13 +257,13 @@ class RandomDrive:
 def run() -> dict[str, object]:
     """Return the quick measurements: the time of a step, and the speed of training."""
     torch.set_num_threads(1)
-    return {"controller_step_ms": step_time(200), **training_rates(4)}
+    return {**step_times(200), **training_rates(4)}
 
 
 def measure(options: Options) -> dict[str, object]:
     """Return the quick measurements, and those that were asked for."""
     torch.set_num_threads(1)
-    result: dict[str, object] = {"controller_step_ms": step_time(options.repeats), **training_rates(options.rounds)}
+    result: dict[str, object] = {**step_times(options.repeats), **training_rates(options.rounds)}
     if options.pendulum_steps:
         pendulum = PendulumMPO(options.seed)
         curve = pendulum.train(options.pendulum_steps)
