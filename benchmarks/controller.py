@@ -21,7 +21,6 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor, nn
 
@@ -34,6 +33,7 @@ from mujoban_core.bodies import BODIES
 from mujoban_core.grid import GRID_SIZE, xy_to_cell
 from mujoban_core.interfaces import ControllerInput
 from mujoban_core.signals import StopSignal
+from mujoban_core.terminal import progress_console
 from mujoban_rl.engine import Learner, Source
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss
@@ -217,7 +217,7 @@ class RandomDrive:
     def play(self, steps: int) -> dict[str, float]:
         """Play, until a signal asks to stop; return numbers of looks with something wrong, highest speeds in m/s."""
         world, rng, report = self.world, self._rng, self.report
-        with StopSignal() as stop, Progress(console=Console(stderr=True)) as bar:
+        with StopSignal() as stop, Progress(console=progress_console()) as bar:
             task = bar.add_task("steps", total=steps)
             while report["random_steps"] < steps and not stop.requested:
                 drawn = rng.uniform(-1.0, 1.0, self._torque.shape).astype(np.float32)

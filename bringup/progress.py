@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from bringup.results import EpisodeResult
+from mujoban_core.terminal import progress_console
 
 
 class EpisodesBar(Progress):
@@ -21,7 +22,7 @@ class EpisodesBar(Progress):
     def __init__(self, total: int, console: Console | None = None) -> None:
         """Count to `total` episodes, on stderr unless another console is given."""
         columns = (TextColumn("{task.description}"), BarColumn(None), MofNCompleteColumn(), TimeElapsedColumn())
-        super().__init__(*columns, console=console or Console(stderr=True), expand=True)
+        super().__init__(*columns, console=console or progress_console(), expand=True)
         self._task = self.add_task("", total=total)
         self._total, self._printed = total, 0
 

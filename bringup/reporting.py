@@ -7,6 +7,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from rich.console import Console
+from rich.table import Table
+
 from bringup.command import Player
 from bringup.options import EpisodeOptions
 from bringup.results import EpisodeResult, report, summary
@@ -77,11 +80,12 @@ class Reporting:
         if self._generated:
             seed_range(episodes.seed, len(episodes))  # refuses what `finish` could not report
 
-    def finish(self, results: Sequence[EpisodeResult], **extra: Any) -> None:
-        """Print the summary and write the report.
+    def finish(self, results: Sequence[EpisodeResult], *, above: Table | None = None, **extra: Any) -> None:
+        """Write the report and print the summary.
 
         Args:
             results: The episodes.
+            above: What is printed above the summary.
             **extra: Further entries.
 
         Raises:
@@ -94,8 +98,10 @@ class Reporting:
 
             seeds = [entry["seed"] for entry in content["episodes"]]
             content |= noted_use(seeds, self._weights, content["played"])
+        keep_report(content, self._path)  # before anything is printed, which nobody may read any more
+        if above is not None:
+            Console().print(above)
         print(*summary(content), sep="\n", flush=True)
-        keep_report(content, self._path)
 
     def __enter__(self) -> Self:
         """Return the report itself."""
@@ -105,6 +111,6 @@ class Reporting:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Report what there is after an interruption or an error: also that test levels were used."""
-        if isinstance(value, KeyboardInterrupt | Exception) and self.results:
+        if isinstance(value, KeyboardInterrupt | SystemExit | Exception) and self.results:
             with StopSignal():
                 self.finish(sorted(self.results, key=lambda result: result.seed), interrupted=self._asked)

@@ -70,8 +70,6 @@ def main(command_line: Sequence[str] | None = None) -> int:
     check_file("--json", options.json)
     episodes = play.make(play.seed, seeds)
 
-    from rich.console import Console
-
     from bringup.reporting import Reporting, played
     from bringup.stack import PlayOptions
     from bringup.stack import play as play_graph
@@ -97,9 +95,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
             show(monitor, results)
 
         outcome = play_graph(stack, episodes, how, on_refresh=on_refresh)
-    if not options.headless:
-        Console().print(summary(outcome.results))
-    reporting.finish(outcome.results, **outcome.figures())
+    table = None if options.headless else summary(outcome.results)
+    reporting.finish(outcome.results, above=table, **outcome.figures())
     return 0
 
 

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from bringup.pipeline import Pipeline
+from mujoban_core.terminal import progress_console
 
 
 class Display:
@@ -58,7 +59,7 @@ def run_shown(pipeline: Pipeline) -> None:
         PipelineError: If a stage fails.
         Interrupted: If a signal came.
     """
-    display = Display(pipeline, Console(stderr=True))
+    display = Display(pipeline, progress_console())
     with display.progress:
         pipeline.run(display.update)
         display.update(pipeline)

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.text import Text
 from torch import Tensor
 
+from mujoban_core.terminal import progress_console
 from mujoban_core.text import readable
 from mujoban_rl.run_directory import RunDirectory
 
@@ -76,7 +77,7 @@ class TrainingLog:
             line_seconds: Between two lines of progress, where there is no terminal.
         """
         self._run, self._files = run.path, ExitStack()
-        self._console = console or Console(stderr=True)
+        self._console = console or progress_console()
         end = "" if total is None else f" of {total:,}"
         self._count = f"{{task.completed:,.0f}}{end} {unit}s"
         self._bar = _Bar(self._console, self._count)

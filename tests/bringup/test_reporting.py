@@ -6,6 +6,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from commands import ALL_ORACLES, UNSOLVABLE, run
@@ -135,6 +136,15 @@ def test_what_was_played_before_an_error_is_reported_and_that_test_levels_were_u
     assert content["interrupted"] == 4 and content["test_uses"][0]["seeds"] == [1000, 1000]
     told = capfd.readouterr()
     assert told.out.count("solved 1 of 1") == 1 and "written nowhere" not in told.err
+
+
+def test_a_report_is_written_though_nobody_reads_its_summary_any_more(tmp_path, monkeypatch):
+    episodes = Episodes(1, 1000)
+    reporting = Reporting(tmp_path / "report.json", {}, episodes, played(Stack(), episodes, EpisodeOptions()))
+    monkeypatch.setattr(sys.stdout, "write", Mock(side_effect=BrokenPipeError))
+    with pytest.raises(BrokenPipeError):
+        reporting.finish([EpisodeResult(1000, True, 11.0, 5, 1, 0, 0, None)])
+    assert json.loads((tmp_path / "report.json").read_text())["test_uses"][0]["seeds"] == [1000, 1000]
 
 
 def test_of_a_file_only_the_levels_that_are_played_are_looked_through(tmp_path, monkeypatch, capsys):

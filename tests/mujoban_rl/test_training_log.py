@@ -1,6 +1,8 @@
+import errno
 import io
 import json
 import re
+import sys
 
 import pytest
 import torch
@@ -30,6 +32,21 @@ def test_a_terminal_of_60_columns_shows_a_bar_and_no_number_cut_off(tmp_path, to
     assert bar.startswith("1,234,567 of 5,000,000 samples ━" if total else "1,234,567 samples ━")
     assert len(bar) <= 60 and "…" not in bar
     assert numbers == "critic 0.977, policy -1,120, solved 0.5, return -7.25"
+
+
+@pytest.mark.parametrize("error", [BrokenPipeError(), OSError(errno.EIO, "Input/output error")])
+def test_a_run_goes_on_and_is_logged_when_nobody_can_read_its_progress_any_more(tmp_path, monkeypatch, error):
+    class Gone(io.StringIO):
+        def write(self, text=""):
+            raise error
+
+        flush = write
+
+    monkeypatch.setattr(sys, "stderr", Gone())
+    with TrainingLog(RunDirectory(tmp_path, {}), line_seconds=0.0) as log:
+        for step in range(3):
+            log.scalars(step, NUMBERS)
+    assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 3
 
 
 def test_a_pipe_gets_plain_lines_now_and_then_and_one_at_the_end(tmp_path):
