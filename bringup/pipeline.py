@@ -8,7 +8,6 @@ are gone where another needs them.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import resource
 import shutil
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from mujoban_core import children
-from mujoban_core.files import digest, write_atomically
+from mujoban_core.files import alone, digest, write_atomically
 from mujoban_core.signals import StopSignal
 
 _PERIOD = 0.2
@@ -185,16 +184,9 @@ class Pipeline:
         """Keep other processes from running the stages of this run; the system frees it however this one ends.
 
         Raises:
-            PipelineError: If another process runs them.
+            InUseError: If another process runs them.
         """
-        self.directory.mkdir(parents=True, exist_ok=True)
-        with (self.directory / "lock").open("ab") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise PipelineError(
-                    f"{self.directory}: another process runs its stages, expected another directory"
-                ) from None
+        with alone(self.directory):
             yield
 
     def _redo_what_is_gone(self) -> None:

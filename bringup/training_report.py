@@ -19,7 +19,7 @@ from bringup.model_card import Place, Score, card
 from bringup.pipeline import Entry, Pipeline
 from mujoban_core.files import write_atomically
 from mujoban_core.text import readable
-from mujoban_rl.metrics import read_metrics
+from mujoban_rl.metrics import METRICS, read_metrics
 from mujoban_sokoban.generator import FRESH_SEEDS
 
 _PREFIX = "evaluation/"
@@ -106,7 +106,7 @@ def draw_curves(run: Path, names: list[str], path: Path) -> bool:
 
 def _rates(run: Path) -> dict[str, list[tuple[float, float]]]:
     """Return the curves that are drawn."""
-    if not (run / "metrics.jsonl").exists():
+    if not (run / METRICS).exists():
         return {}
     return {name: points for name, points in read_curves(run).items() if name.startswith(_RATES)}
 
@@ -131,8 +131,9 @@ def _steps(run: Path) -> int:
     recorded = sum(int(ticks) for log in logs for ticks in _RECORDED.findall(log.read_text()))
     # What was kept of another run was taken there.
     trained = (name for name, entry in Pipeline.read(run).entries.items() if not _is_kept(entry))
-    metrics = (run / name / "metrics.jsonl" for name in trained if name.startswith(_ACTING))
-    return recorded + sum(json.loads(file.read_text().splitlines()[-1])["step"] for file in metrics if file.exists())
+    acted = (run / name for name in trained if name.startswith(_ACTING))
+    lines = (read_metrics(stage) for stage in acted if (stage / METRICS).exists())
+    return recorded + sum(stage[-1]["step"] for stage in lines if stage)
 
 
 def _is_kept(entry: Entry) -> bool:

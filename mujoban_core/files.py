@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import shutil
@@ -14,6 +15,29 @@ _DEVICES = (Path("/dev"), Path("/proc"))
 
 
 _UNFINISHED = ".unfinished"
+LOCK = "lock"
+"""Name of the file in a folder by which a process keeps others out."""
+
+
+class InUseError(ValueError):
+    """Another process is at work in a folder."""
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Keep other processes from working in a folder; the system lets them in again however this one ends.
+
+    Raises:
+        InUseError: If another process is at work there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK).open("ab") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            what = "another process is at work here, expected that it has ended, or another directory"
+            raise InUseError(f"{folder}: {what}") from None
+        yield
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from mujoban_core import children
+from mujoban_core.files import alone
 from mujoban_core.program import say
 from mujoban_core.signals import Interrupted, StopSignal
 from mujoban_core.text import readable
@@ -246,6 +247,8 @@ class Trainer(Generic[BatchT]):
 
         Raises:
             Interrupted: If a signal came; the run is saved then.
+            InUseError: If another process trains in the run's directory.
+            ValueError: If the limit of seconds is below 0 or no number.
         """
         children.end_with_parent()
         keep_freed_memory()
@@ -254,6 +257,7 @@ class Trainer(Generic[BatchT]):
         limits = _Limits(TimeLimit(limit_seconds), limit_samples, limit_updates)
         try:
             with (
+                alone(self.directory.path),
                 TrainingLog(self.directory, total=total, initial=self.progress.samples, unit="sample") as log,
                 StopSignal() as stop,
             ):

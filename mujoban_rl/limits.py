@@ -44,7 +44,13 @@ class TimeLimit:
     """Wall-clock limit of one bit of a run."""
 
     def __init__(self, seconds: float | None) -> None:
-        """Count from now; None never ends."""
+        """Count from now; None never ends.
+
+        Raises:
+            ValueError: If the limit is below 0 or no number.
+        """
+        if seconds is not None and not seconds >= 0.0:
+            raise ValueError(f"a limit of {seconds:g} seconds: expected 0 or more")
         self._seconds = math.inf if seconds is None else seconds
         self._start = time.monotonic()
 

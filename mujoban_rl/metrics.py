@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+METRICS: Final = "metrics.jsonl"
+"""File of a run that has them, a line each time."""
 COUNT: Final = "_n"
 """Ends the name under which a line says of how many values a mean is."""
 
@@ -14,21 +17,32 @@ COUNT: Final = "_n"
 def read_metrics(run: Path) -> list[dict[str, Any]]:
     """Return the lines of a run, in the order of `step`.
 
-    A run that was killed went on from its last checkpoint: what it had come to after that was lost, and is left out.
+    A run that was killed went on from its last checkpoint: what it had come to after that was lost, and is left out. So
+    is a last line that breaks off, as where the disk was full.
 
     Raises:
         ValueError: If they are missing or damaged.
     """
     lines: list[dict[str, Any]] = []
     try:
-        for line in map(json.loads, (run / "metrics.jsonl").read_text().splitlines()):
+        whole, _, _ = (run / METRICS).read_text().rpartition("\n")
+        for line in map(json.loads, whole.splitlines()):
             while lines and any(lines[-1].get(spent, 0.0) > line.get(spent, 0.0) for spent in ("step", "cpu_seconds")):
                 lines.pop()
             lines.append(line)
     except (OSError, json.JSONDecodeError, AttributeError) as error:
-        why = "no metrics.jsonl" if isinstance(error, OSError) else f"metrics.jsonl: {error}"
+        why = f"no {METRICS}" if isinstance(error, OSError) else f"{METRICS}: {error}"
         raise ValueError(f"{run}: {why}, expected the run directory of a trainer") from error
     return lines
+
+
+def drop_half_line(file: Path) -> None:
+    """Cut off a last line that breaks off, so that none is written behind it; there need not be such a file."""
+    if not file.exists():
+        return
+    content = file.read_bytes()
+    if (kept := content.rfind(b"\n") + 1) < len(content):
+        os.truncate(file, kept)
 
 
 def mean_of(lines: Iterable[dict[str, Any]], keys: Sequence[str]) -> tuple[float, float] | None:

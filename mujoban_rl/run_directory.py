@@ -16,11 +16,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from mujoban_core.files import digest, naming, replacing_alone, write_atomically
+from mujoban_core.files import LOCK, digest, naming, replacing_alone, write_atomically
 from mujoban_rl.weights import check_finite
 
 _ANOTHER = "choose another directory"
 _CONFIG: Final = "config.json"
+_CHECKPOINTS: Final = "checkpoint-*.safetensors"
 _SYSTEM_ERROR: Final = re.compile(r"\(os error (\d+)\)")
 
 
@@ -77,7 +78,7 @@ class RunDirectory:
         self.config = self.options | fixed
         self.path.mkdir(parents=True, exist_ok=True)
         file = self.path / _CONFIG
-        if file.exists() and any(other != file for other in self.path.iterdir()):
+        if file.exists() and any(other.name not in (_CONFIG, LOCK) for other in self.path.iterdir()):
             # An option that there was not yet when the run began is as if it had been left alone.
             stored = _overlaid(_defaults(config), fixed | _read_config(file))
             changed = sorted(k for k in stored.keys() | self.config.keys() if stored.get(k) != self.config.get(k))
@@ -126,6 +127,8 @@ class RunDirectory:
         check_finite(flat, f"checkpoint at step {step}")
         content: dict[str, Any] = {"step": step, "optimisers": scalars, "extra": dict(extra or {})}
         json.dumps(content, allow_nan=False)  # before anything is written
+        for lone in set(self.path.glob(_CHECKPOINTS)) - set(self._checkpoints()):
+            lone.unlink()
         path = self.path / f"checkpoint-{step:010d}.safetensors"
         # Into a file and not into memory: a replay may take up most of that.
         with naming(path), replacing_alone(path) as temporary:
@@ -251,7 +254,9 @@ def _newest_intact(directory: Path) -> tuple[Path, dict[str, Any], dict[str, Ten
 
 
 def _newest_first(directory: Path) -> list[Path]:
-    return sorted(directory.glob("checkpoint-*.safetensors"), reverse=True)
+    """Return the checkpoints of a run; of one without its JSON part its process was killed while it wrote it."""
+    found = sorted(directory.glob(_CHECKPOINTS), reverse=True)
+    return [path for path in found if path.with_suffix(".json").exists()]
 
 
 def _as_json(config: Any) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from mujoban_core.terminal import progress_console
 from mujoban_core.text import readable
+from mujoban_rl.metrics import METRICS, drop_half_line
 from mujoban_rl.run_directory import RunDirectory
 
 if TYPE_CHECKING:
@@ -119,7 +120,9 @@ class TrainingLog:
         from torch.utils.tensorboard.writer import SummaryWriter
 
         writer = self._files.enter_context(SummaryWriter(str(self._run / "tensorboard")))
-        return writer, self._files.enter_context((self._run / "metrics.jsonl").open("a", encoding="utf-8"))
+        metrics = self._run / METRICS
+        drop_half_line(metrics)
+        return writer, self._files.enter_context(metrics.open("a", encoding="utf-8"))
 
     def _print_progress(self) -> None:
         """Print a line of progress, unless a terminal shows the bar."""

@@ -7,7 +7,8 @@ import torch
 from torch import nn
 
 from bringup.carry import carry, main
-from bringup.pipeline import Pipeline, PipelineError
+from bringup.pipeline import Pipeline
+from mujoban_core.files import InUseError
 from mujoban_rl.run_directory import RunDirectory
 
 
@@ -51,7 +52,7 @@ def test_weights_and_light_checkpoints_are_copied_but_neither_bags_nor_what_was_
 
 
 def test_a_run_whose_stages_run_is_not_copied(run, tmp_path):
-    with Pipeline.read(run).alone(), pytest.raises(PipelineError, match="another process runs its stages"):
+    with Pipeline.read(run).alone(), pytest.raises(InUseError, match="another process is at work here"):
         carry(run, tmp_path / "out")
 
 

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from bringup.pipeline import Pipeline, PipelineError, Stage
-from mujoban_core.files import digest
+from mujoban_core.files import InUseError, digest
 from mujoban_core.signals import Interrupted
 
 COPY = "import sys, pathlib; pathlib.Path(sys.argv[2]).write_text(pathlib.Path(sys.argv[1]).read_text() + 'b')"
@@ -182,7 +182,7 @@ def test_two_runs_of_one_directory_are_refused(tmp_path):
     refused = []
 
     def run_again(pipeline):
-        with pytest.raises(PipelineError, match="another process runs its stages, expected another directory"):
+        with pytest.raises(InUseError, match="another process is at work here, expected that it has ended, or another"):
             Pipeline(tmp_path, stages(tmp_path)).run()
         refused.append(pipeline.running())
 

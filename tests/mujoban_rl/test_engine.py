@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import nn
 
+from mujoban_core.files import InUseError
 from mujoban_core.signals import Interrupted
 from mujoban_rl.engine import CARRIED, Budget, Cadence, Learner, Source, State, Trainer
 from mujoban_rl.limits import NaNGuard
@@ -259,6 +260,21 @@ def test_an_average_that_warms_up_forgets_early_weights_soon():
 def test_a_source_without_more_ends_the_run(tmp_path):
     run = trainer(tmp_path, Noise(end=5))
     assert run.run() and run.progress.updates == 5
+
+
+def test_two_processes_do_not_train_in_one_directory(tmp_path):
+    def train_again(_):
+        with pytest.raises(InUseError, match="another process is at work here, expected that it has ended, or another"):
+            trainer(tmp_path).run()
+
+    assert trainer(tmp_path, Noise(end=2, on_batch=train_again)).run()
+    assert trainer(tmp_path, Noise(end=2)).run()
+
+
+@pytest.mark.parametrize("seconds", [-1.0, math.nan])
+def test_a_limit_that_is_no_time_is_refused(tmp_path, seconds):
+    with pytest.raises(ValueError, match=f"a limit of {seconds:g} seconds: expected 0 or more"):
+        trainer(tmp_path).run(limit_seconds=seconds)
 
 
 def test_a_budget_that_is_no_amount_is_refused():

@@ -177,9 +177,19 @@ def test_damaged_newest_checkpoint_falls_back_to_the_one_before(tmp_path, half, 
     run.save(2, modules={"net": net}).with_suffix(f".{half}").write_bytes(content)
     snapshot = run.load(modules={"net": Net()})
     assert snapshot is not None and snapshot.step == 1
-    (tmp_path / "checkpoint-0000000001.json").unlink()
+    (tmp_path / "checkpoint-0000000001.json").write_bytes(b"[]")
     with pytest.raises(RunError, match="none of 2 checkpoints"):
         run.load(modules={"net": Net()})
+
+
+def test_a_run_that_was_killed_in_its_first_checkpoint_begins_anew(tmp_path):
+    net, _ = _make()
+    run = RunDirectory(tmp_path, {})
+    killed = run.save(1, modules={"net": net})
+    killed.with_suffix(".json").unlink()
+    assert run.load(modules={"net": Net()}) is None
+    run.save(2, modules={"net": net})
+    assert not killed.exists()
 
 
 def test_only_the_last_checkpoints_are_kept_and_nan_is_never_written(tmp_path):

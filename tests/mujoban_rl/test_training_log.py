@@ -8,6 +8,7 @@ import pytest
 import torch
 from rich.console import Console
 
+from mujoban_rl.metrics import read_metrics
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.training_log import TrainingLog
 
@@ -20,6 +21,15 @@ def test_log_keeps_a_readable_learning_curve(tmp_path):
         log.scalars(1, {"loss": torch.tensor(0.5), "bad": float("nan")})
     line = json.loads((tmp_path / "metrics.jsonl").read_text())
     assert (line["step"], line["loss"], line["bad"]) == (1, 0.5, None)
+
+
+def test_a_line_that_broke_off_on_a_full_disk_is_not_read_and_not_written_behind(tmp_path):
+    file = tmp_path / "metrics.jsonl"
+    file.write_text('{"step": 1}\n{"step": 2, "lo')
+    assert read_metrics(tmp_path) == [{"step": 1}]
+    with TrainingLog(RunDirectory(tmp_path, {})) as log:
+        log.scalars(3, {"loss": 0.5})
+    assert [line["step"] for line in read_metrics(tmp_path)] == [1, 3]
 
 
 @pytest.mark.parametrize("total", [5_000_000, None])
