@@ -70,10 +70,15 @@ def load_module(role: str, source: str = LEARNED, weights: Path | None = None, d
     return _make(role, _interface(role), source, weights, device)
 
 
+def trained_body(module: Module | Scout) -> str | None:
+    """Return the name of the body that a learned module was trained for, or None if it does not say so."""
+    config = getattr(module, "config", {})
+    return config.get("body") if isinstance(config, dict) else getattr(config, "body", None)
+
+
 def check_body(role: str, module: Module | Scout, body: str) -> None:
     """Raise a `ValueError` if a learned module was trained for another body than the one that is played."""
-    config = getattr(module, "config", {})
-    trained = config.get("body") if isinstance(config, dict) else getattr(config, "body", None)
+    trained = trained_body(module)
     if trained not in (None, body):
         other = f"the {SCRIPTED} one" if role == SCOUT else "an oracle"
         raise ValueError(f"the {role} was trained for the body {trained}: expected weights for {body}, or {other}")

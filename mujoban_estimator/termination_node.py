@@ -70,6 +70,9 @@ class TerminationNode(ModuleNode[Termination]):
 
     def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
         """Wait for A_{t-1}, unless this node has only just joined the episode."""
+        if episode.step == 0:
+            # What was said before is of another episode, or of a simulator that ran before this one.
+            self._said.clear()
         joined = self.state is not None and episode.step > 0
         if joined and not insist and stamp - topics.TICK not in self._said:
             return None

@@ -129,6 +129,7 @@ class SimulatorNode(GraphNode):
         self._held_torque = np.zeros(self.world.body.action_size, np.float32)
         self._first = 0  # stamp of the episode's first tick, before which no answer is meant for it
         self._instruction: conversions.InstructionReading | None = None
+        self._instructed = -1  # stamp of the newest instruction so far: an older one that comes late is over
         self._in_force = conversions.InstructionReading(0, 0)
         awaited = {"await_recorder": topics.RECORDED, "await_monitor": topics.MONITORED}
         self._witnesses = [topic for name, topic in awaited.items() if self._settings[name]]
@@ -336,9 +337,9 @@ class SimulatorNode(GraphNode):
     def _on_instruction(self, message: Received) -> None:
         if not self._is_known(message.stamp, topics.INSTRUCTION.name):
             return
-        late = self._speed > 0 and self._instruction is None and message.stamp >= self._first
+        late = self._speed > 0 and message.stamp >= self._first and message.stamp > self._instructed
         if message.stamp == self._stamp or late:
-            self._instruction = message.content
+            self._instruction, self._instructed = message.content, message.stamp
             self._proceed()
 
     def _on_confirmed(self, topic: Topic, message: Received) -> None:

@@ -11,6 +11,8 @@ from mujoban_msgs_py.bags.writer import BagWriter
 
 REPLACED: Final = ".damaged"
 """End of the name that a bag gets whose place a recovered one takes; trainers pass it over among others."""
+PARTIAL: Final = ".reindexed"
+"""End of the name of a recovered bag until then; they pass it over as well."""
 
 
 def recover_bag(source: str | Path, target: str | Path) -> list[str]:

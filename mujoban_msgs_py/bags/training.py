@@ -19,14 +19,16 @@ from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.metadata import FILE_NAME
 from mujoban_msgs_py.bags.reader import Bag, open_bag
-from mujoban_msgs_py.bags.recovery import REPLACED
+from mujoban_msgs_py.bags.recovery import PARTIAL, REPLACED
 from mujoban_msgs_py.conversions import EpisodeTruthReading
 from mujoban_msgs_py.topics import Topic
 from mujoban_sokoban.generator import TEST_SEEDS, TRAIN_SEEDS
 
 
 def find_bags(folders: Sequence[Path]) -> list[Path]:
-    """Return the bags among the given paths: each is a bag, or a folder of bags; what `REPLACED` ends is none of these.
+    """Return the bags among the given paths: each is a bag, or a folder of bags.
+
+    Names that end in `REPLACED` or `PARTIAL` are not of bags to learn from.
 
     Raises:
         BagError: If there is none at a path.
@@ -38,7 +40,7 @@ def find_bags(folders: Sequence[Path]) -> list[Path]:
         if _is_bag(folder):
             found.append(folder)
             continue
-        below = sorted(p for p in folder.iterdir() if p.is_dir() and p.suffix != REPLACED and _is_bag(p))
+        below = sorted(p for p in folder.iterdir() if p.is_dir() and p.suffix not in (REPLACED, PARTIAL) and _is_bag(p))
         if not below:
             raise BagError(f"no bag in {folder}: expected folders with {FILE_NAME}, .mcap or .db3 files")
         found += below

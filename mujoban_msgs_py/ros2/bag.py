@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from mujoban_msgs_py.bags import open_bag, recover_bag
-from mujoban_msgs_py.bags.recovery import REPLACED
+from mujoban_msgs_py.bags.recovery import PARTIAL, REPLACED
 from mujoban_msgs_py.ros2 import bag_play, bag_record
 from mujoban_msgs_py.ros2.session import CommandError
 from mujoban_msgs_py.ros2.verbs import Verbs
@@ -68,7 +68,10 @@ def reindex(options: argparse.Namespace) -> int:
         CommandError: If there is something of that name.
     """
     path = Path(options.bag_path)
-    partial, replaced = path.with_name(path.name + ".reindexed"), path.with_name(path.name + REPLACED)
+    partial, replaced = path.with_name(path.name + PARTIAL), path.with_name(path.name + REPLACED)
+    if partial.exists() and replaced.exists() and not path.exists():
+        partial.rename(path)  # all that a command which was killed had left to do
+        return 0
     if replaced.exists():
         raise CommandError(f"{replaced} exists already: expected that name to be free, for the bag as it was")
     shutil.rmtree(partial, ignore_errors=True)

@@ -16,10 +16,18 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
-from mujoban_core.bodies import BALL, get_body
+from mujoban_core.bodies import BALL, BODIES, get_body
 from mujoban_core.interfaces import GroundTruth, Module, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
-from mujoban_core.plugins import LEARNED, PRIVILEGED, check_body, check_told, chosen_weights, load_module
+from mujoban_core.plugins import (
+    LEARNED,
+    PRIVILEGED,
+    check_body,
+    check_told,
+    chosen_weights,
+    load_module,
+    trained_body,
+)
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.adapted import Adapted, message_of
@@ -103,7 +111,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
             about = "ticks of a look, a turn on the spot; 0: none, -1: those of the body"
             look = described(about, fixed=True, low=OWN_LOOK, high=MOST_TICKS)
             self._look_around = declare(self, "look_around", 0, look)
-        self.module = self._load(weights, device)
+        self.module, self._driven = self._load(weights, device)
         self.state: Any = None
         """What `step` of the module takes and returns; None before an episode."""
         self._episode = -1
@@ -128,6 +136,13 @@ class ModuleNode(TickNode, Generic[ModuleT]):
     @abstractmethod
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
         """Advance `self.state` by one tick and return what to publish."""
+
+    def check(self, topic: Topic, item: Any) -> None:
+        """Refuse the proprioception of another body, such as that of a simulator which was started with one."""
+        body = None if topic is not topics.PROPRIO or self._driven is None else BODIES.get(self._driven)
+        if body is not None and item.shape != (body.proprio_size,):
+            said = f"o_pr of the body {body.name} must have shape [{body.proprio_size}], got {[*item.shape]}"
+            raise conversions.ConversionError(said)
 
     def say(self, episode: Episode, value: Any, to_msg: Callable[[Header, Any], Message]) -> Sequence[Output]:
         """Return a tick's answer: a value as the topic's reader has it, and what makes its message of a header."""
@@ -172,7 +187,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         self._episode = number
         self.take_up(stamp, [Output(self._publisher, answer)] if answer else ())
 
-    def _load(self, weights: str, device: str) -> ModuleT:
+    def _load(self, weights: str, device: str) -> tuple[ModuleT, str | None]:
+        """Return the module, and the body that it is of, where it is of one."""
         path = Path(weights) if weights else None
         if self._body:
             path = chosen_weights(self.role, self._source, path, self._body)
@@ -182,7 +198,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         # `load_module` has checked that it is of the role.
         body = get_body(self._body) if self._body else BALL
         ticks = body.look_ticks if self._look_around == OWN_LOOK else self._look_around
-        return cast(ModuleT, look_around(self.prepare(module), ticks, self.scout, body))
+        driven = trained_body(module) or self._body or None
+        return cast(ModuleT, look_around(self.prepare(module), ticks, self.scout, body)), driven
 
     @property
     def scout(self) -> Scout | None:
@@ -204,13 +221,13 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         current: dict[str, Any] = {name: self.get_parameter(name).value for name in ("weights", "device")}
         weights, device = (changed.get(name, value) for name, value in current.items())
         try:
-            module = self._load(weights, device)
+            module, driven = self._load(weights, device)
             if self.asks(module) and not self._told:
                 raise ValueError(f"weights {weights} need the ground truth: expected to be given when the node starts")
         except (ValueError, OSError, RuntimeError) as error:
             self.counts["refused weights"] += 1
             return SetParametersResult(successful=False, reason=str(error))
-        self.module, self.state = module, None
+        self.module, self._driven, self.state = module, driven, None
         if self._kept is not None:
             # The process after this one begins with the weights of the start, which may remember otherwise.
             self._kept.remove()

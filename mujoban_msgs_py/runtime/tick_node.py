@@ -119,6 +119,9 @@ class TickNode(GraphNode):
             insist: Whether the simulator has offered the tick repeatedly: waiting will not help.
         """
 
+    def check(self, topic: Topic, item: Any) -> None:
+        """Raise a ValueError if what a message says, which is sound in itself, is nothing to this node."""
+
     def open_inputs(self, inputs: Sequence[Input]) -> None:
         """Subscribe to `/episode` and to what `answer` needs besides."""
         every = [Input(EPISODE, checked(EPISODE)), *inputs]
@@ -164,6 +167,7 @@ class TickNode(GraphNode):
             if stamp <= self._handled and topic is not EPISODE:
                 return
             item = message.content(decode)
+            self.check(topic, item)
         except ValueError as error:
             reject(self, topic.name, error)
             return

@@ -26,6 +26,7 @@ from std_srvs.srv import SetBool
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter, open_bag
+from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.training import find_bags
 from mujoban_msgs_py.ros2.main import environment_outside, is_prepared, other_command, run
 from mujoban_msgs_py.ros2.messages import fill, to_csv, to_yaml
@@ -308,6 +309,11 @@ def test_a_damaged_bag_is_described_with_a_warning_and_reindexed(bag):
     assert (old / file.name).read_bytes() == damaged
     assert find_bags([bag.parent]) == [bag], "nobody learns from both"
     assert f"{old} exists already" in ros2("bag", "reindex", str(bag), status=1)
+    bag.rename(bag.with_name("bag.reindexed"))  # as where the command was killed just before its end
+    with pytest.raises(BagError, match="no bag in"):
+        find_bags([bag.parent])
+    ros2("bag", "reindex", str(bag))
+    assert find_bags([bag.parent]) == [bag]
 
 
 def test_services_tell_their_type(talker):
