@@ -38,7 +38,7 @@ class VTraceTrainingConfig:
     """Learning rate; it falls to 0 along a line."""
     clip: float = 40.0
     auxiliary: float = 0.5
-    """Weight of the loss of subgoals (paper D.2)."""
+    """Weight of the loss of subgoals (paper D.2), which structured-vtrace alone has."""
     beyond: float = 0.05
     """Weight of the squares by which mean torques are beyond their limits: from where all draws are one to the world
     no reward leads back."""

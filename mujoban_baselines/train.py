@@ -239,8 +239,6 @@ class _Command(ABC):
 
     run: Path
     """Run directory; an existing one is resumed."""
-    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
-    """Where the robots are."""
     seconds: float | None = None
     """Stop after so many seconds; resume later."""
     save_every: float = 300.0
@@ -258,7 +256,15 @@ class _Command(ABC):
 
 
 @dataclass(frozen=True)
-class MonolithicMPO(_Command):
+class _ActorCommand(_Command):
+    """What trainings with actors have in common."""
+
+    actors: Annotated[ActorOptions, tyro.conf.arg(name="")] = field(default_factory=ActorOptions)
+    """Where the robots are."""
+
+
+@dataclass(frozen=True)
+class MonolithicMPO(_ActorCommand):
     """Monolithic RL: camera, proprioception and pose to torques, by MPO (paper D.1)."""
 
     config: Annotated[MPORunConfig, tyro.conf.arg(name="")] = field(default_factory=MPORunConfig)
@@ -288,7 +294,7 @@ class Clone(_Command):
 
 
 @dataclass(frozen=True)
-class MonolithicVTrace(_Command):
+class MonolithicVTrace(_ActorCommand):
     """Fully observable monolithic RL: view from above and proprioception to torques, by V-trace (paper D.2)."""
 
     config: Annotated[VTraceRunConfig, tyro.conf.arg(name="")] = field(default_factory=VTraceRunConfig)
@@ -300,7 +306,7 @@ class MonolithicVTrace(_Command):
 
 
 @dataclass(frozen=True)
-class StructuredVTrace(_Command):
+class StructuredVTrace(_ActorCommand):
     """Fully observable structured RL: also the abstract state, and pseudo rewards for adjacent ones (paper D.2)."""
 
     config: Annotated[VTraceRunConfig, tyro.conf.arg(name="")] = field(default_factory=VTraceRunConfig)
@@ -312,7 +318,7 @@ class StructuredVTrace(_Command):
 
 
 @dataclass(frozen=True)
-class Joint(_Command):
+class Joint(_ActorCommand):
     """The modular stack fine-tuned: planner and controller together by MPO on the overall reward."""
 
     config: Annotated[JointRunConfig, tyro.conf.arg(name="")] = field(default_factory=JointRunConfig)

@@ -18,9 +18,9 @@ if __name__ == "__main__":
 
     end_at_once()
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -264,10 +264,20 @@ class _Parts:
         config, n = self.config, self.config.network
         if config.initial is not None:
             policy = load_weights(VisuomotorController, config.initial, body=config.task.body)
+            check_network(n, policy.config, config.initial)
         else:
             policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden, n.place, n.way)
         policy.mixed_precision = True
         return policy.to(self.device).train()
+
+
+def check_network(asked: NetworkConfig, own: Mapping[str, Any], weights: Path) -> None:
+    """Raise a ValueError if options ask for another network than that of the weights that training begins with."""
+    default = asdict(NetworkConfig())
+    for name, value in asdict(asked).items():
+        has = tuple(own[name]) if isinstance(value, tuple) else own[name]
+        if value not in (default[name], has):
+            raise ValueError(f"--network.{name} {value}: that of --initial {weights} is {has}, expected it or none")
 
 
 def _data(options: Options) -> str:

@@ -39,16 +39,26 @@ _SEEDS_PER_STREAM: Final = 10**12
 class PlayConfig(MPOSettings):
     """What defines how an actor plays, and how is learned from it."""
 
-    failure_rate: float = 0.0
-    """Probability that an instruction fails, as with a real controller."""
     mix: Shares = (0.1, 0.1, 0.15, 0.2, 0.45)
     """Share of each difficulty among the training levels."""
 
     def __post_init__(self) -> None:
         """Reject what is no share."""
         super().__post_init__()
-        check_shares(self, "failure_rate")
         check_mix(self.mix)
+
+
+@dataclass(frozen=True)
+class MoveConfig(PlayConfig):
+    """What defines how moves are played."""
+
+    failure_rate: float = 0.0
+    """Probability that an instruction fails, as with a real controller."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no share."""
+        super().__post_init__()
+        check_shares(self, "failure_rate")
 
 
 class LevelStream:
@@ -164,7 +174,7 @@ class MoveActor(SequenceActor):
 
     def __init__(
         self,
-        config: PlayConfig,
+        config: MoveConfig,
         architecture: type[LearnedPlanner],
         network: Mapping[str, Any],
         stream: int,

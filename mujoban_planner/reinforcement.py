@@ -25,7 +25,7 @@ from mujoban_planner.discrete_mpo import MPOBatch, StepStore
 from mujoban_planner.growth import beginning
 from mujoban_planner.heads import silence_verdicts
 from mujoban_planner.move_learner import MoveLearner
-from mujoban_planner.moves import MoveActor, PlayConfig
+from mujoban_planner.moves import MoveActor, MoveConfig
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.product import PlannerLearner
 from mujoban_planner.validation import NetworkConfig
@@ -40,7 +40,7 @@ _PLAYED: Final = "abstract environment on generated levels, training seeds"
 
 
 @dataclass(frozen=True)
-class MPOConfig(PlayConfig, NetworkConfig):
+class MPOConfig(MoveConfig, NetworkConfig):
     """What defines an MPO run."""
 
     teach_pushes: bool = False
@@ -56,7 +56,7 @@ class MPOConfig(PlayConfig, NetworkConfig):
 
     def __post_init__(self) -> None:
         """Reject what is no share, and a budget of nothing."""
-        PlayConfig.__post_init__(self)
+        MoveConfig.__post_init__(self)
         NetworkConfig.__post_init__(self)
         check_positive(self, "cpu_seconds")
         check_not_negative(self, "anchor")

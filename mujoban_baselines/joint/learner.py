@@ -125,8 +125,9 @@ class JointLearner(Learner[JointBatch]):
         return stats
 
     def weights(self) -> Mapping[str, Tensor]:
-        """Return the policies' weights."""
-        return self.networks.weights()
+        """Return those of the policies that act."""
+        controller = {f"controller.{name}": value for name, value in self.controller.weights().items()}
+        return self.networks.weights() | controller
 
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write `controller.safetensors` and `planner.safetensors` with their records."""

@@ -110,7 +110,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         if self.role in LOOKING_ROLES:
             about = "ticks of a look, a turn on the spot; 0: none, -1: those of the body"
             look = described(about, fixed=True, low=OWN_LOOK, high=MOST_TICKS)
-            self._look_around = declare(self, "look_around", 0, look)
+            self._look_around = declare(self, "look_around", OWN_LOOK, look)
         self.module, self._driven = self._load(weights, device)
         self.state: Any = None
         """What `step` of the module takes and returns; None before an episode."""

@@ -7,6 +7,7 @@ neighbour which was restarted in between receives what it has missed.
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
 import time
@@ -27,6 +28,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
+from rclpy.utilities import remove_ros_args
 
 from mujoban_core.children import end_with_parent
 from mujoban_core.signals import StopSignal, interruptible
@@ -50,6 +52,8 @@ _DEADLINE = 3600.0
 PATIENCE = 60
 """Repeated offers of a tick after which a node answers without what it still waits for: one that was killed is back by
 then, and has said it."""
+
+_USAGE = "--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO, as every node of ROS takes them"
 
 
 class Input(NamedTuple):
@@ -296,10 +300,17 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
 
     Returns:
         Exit status: 0, as `ros2 launch` expects it of a node that was interrupted, or 2 after one line on stderr
-        about bad input.
+        about bad input, such as arguments that are not ROS's.
     """
     end_with_parent()
     try:
+        # Of the process's own the first is its name.
+        given = remove_ros_args(args)[args is None :]
+        if {"-h", "--help"} & {*given}:
+            print(inspect.getdoc(make) or "", f"Arguments: {_USAGE}", sep="\n\n")
+            return 0
+        if given:
+            raise ValueError(f"{given[0]} is no option of a node, expected {_USAGE}")
         with interruptible(), StopSignal(deferred=False) as stop, ros_context(args):
             _run(make, stop)
     except KeyboardInterrupt:

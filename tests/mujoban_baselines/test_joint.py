@@ -122,6 +122,17 @@ def test_policies_are_held_while_their_critics_learn_and_move_after_that():
     source.close()
 
 
+def test_the_moving_average_of_the_controller_acts():
+    controller = MPOTrainingConfig(**{**vars(CONTROLLER), "average": 0.9})
+    learner, source = learner_and_source(JointSettings(look_around=0, controller=controller, planner=SMALL.planner))
+    with torch.no_grad():
+        learner.networks.controller.mean.weight.add_(1.0)
+    acts = learner.weights()["controller.mean.weight"]
+    assert torch.equal(acts, learner.controller.product.mean.weight)
+    assert not torch.equal(acts, learner.networks.controller.mean.weight)
+    source.close()
+
+
 def decisions_of(actor, sequences):
     """Return how many decisions are finished in so many sequences of three new ticks each."""
     return sum(len(actor.act().arrays["decision/reward"]) for _ in range(sequences))

@@ -159,6 +159,17 @@ def test_weights_of_another_body_are_refused_by_name(stage, option, of, tmp_path
         make_trainer(Options(tmp_path / "run", replace(STAGES[stage], **{option: file}), evaluation_episodes=0))
 
 
+def test_a_network_unlike_the_one_that_training_begins_with_is_refused(tmp_path):
+    policy, file = VisuomotorController("ball", channels=(8, 8), features=16, hidden=8), tmp_path / "w.safetensors"
+    save_weights(file, policy, policy.config, {})
+    for network in (NetworkConfig(), NetworkConfig((8, 8), 16, 8)):
+        config = replace(STAGES["asymmetric"], initial=file, network=network)
+        make_trainer(Options(tmp_path / str(network.hidden), config, evaluation_episodes=0))
+    with pytest.raises(ValueError, match=r"--network\.hidden 9: that of --initial .*w\.safetensors is 8, expected it"):
+        config = replace(config, network=NetworkConfig((8, 8), 16, 9))
+        make_trainer(Options(tmp_path / "other", config, evaluation_episodes=0))
+
+
 def test_the_best_product_on_validation_levels_is_exported(teacher, tmp_path):
     learner = make_trainer(Options(tmp_path, replace(STAGES["ppo"], steps=64), evaluation_episodes=2)).learner
     with torch.no_grad():

@@ -7,7 +7,7 @@ from rclpy.serialization import serialize_message
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.arrivals import Serialised
-from mujoban_msgs_py.runtime.tick_node import PATIENCE, Input, TickNode
+from mujoban_msgs_py.runtime.tick_node import PATIENCE, Input, TickNode, run_node
 
 
 class Waiting(TickNode):
@@ -44,6 +44,13 @@ def test_a_tick_that_is_offered_again_is_waited_for_as_long_as_before(waiting):
     assert waiting.answered == []
     waiting.offer(5)
     assert waiting.answered == [5]
+
+
+def test_a_node_refuses_arguments_that_are_not_ros_and_tells_of_itself_when_asked(capsys):
+    assert run_node(Waiting, ["--weights", "mine"]) == 2
+    assert "error: --weights is no option of a node, expected --ros-args -p NAME:=VALUE" in capsys.readouterr().err
+    assert run_node(Waiting, ["--ros-args", "-p", "a:=1", "--", "--help"]) == 0
+    assert "--ros-args -p NAME:=VALUE" in capsys.readouterr().out
 
 
 def test_where_time_goes_on_the_next_tick_does_not_wait_as_well(waiting):
