@@ -12,8 +12,8 @@ if __name__ == "__main__":
     end_at_once()
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 from tyro.conf import arg
 
@@ -33,13 +33,15 @@ if TYPE_CHECKING:
     from mujoban_sokoban.episodes import Episodes
 
 PROG = "evaluate.py"
+_EPISODES: Final = 256
+"""Generated levels that are played where no number is said."""
 
 
 @dataclass(frozen=True)
 class Options:
     """Evaluate the stack on many levels in one vectorised rollout; by default on levels for validation."""
 
-    play: Annotated[EpisodeOptions, arg(name="")] = field(default_factory=lambda: EpisodeOptions(episodes=256))
+    play: Annotated[EpisodeOptions, arg(name="")] = field(default_factory=EpisodeOptions)
     modules: Annotated[PlayerOptions, arg(name="")] = field(default_factory=PlayerOptions)
     batch: Count = 64
     """Episodes that run at the same time."""
@@ -100,6 +102,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
     from bringup.reporting import Reporting, played
     from mujoban_sokoban.generator import VALIDATION_SEEDS
 
+    if options.play.episodes is None and options.play.levels is None:
+        options = replace(options, play=replace(options.play, episodes=_EPISODES))
     play = options.play
     episodes = play.make(play.seed, VALIDATION_SEEDS)
     stack = options.modules.player(play.body)

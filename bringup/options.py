@@ -187,7 +187,7 @@ class EpisodeOptions(WorldOptions):
     difficulty: Annotated[int, one_of(sorted(DIFFICULTIES))] = max(DIFFICULTIES)
     """Difficulty of generated levels."""
     episodes: Annotated[int | None, whole("N")] = None
-    """Number of episodes; by default one, or as many as the level file has."""
+    """Number of episodes; by default one (evaluate.py: 256), or as many as the level file has."""
     seed: Annotated[int | None, whole("N", 0)] = None
     """Seed of the first episode; episode i has seed + i. By default none of those for results (docs/levels.md)."""
     time_limit: Annotated[int | None, whole("STEPS")] = None

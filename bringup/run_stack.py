@@ -37,7 +37,8 @@ class Options:
     processes: bool = False
     """Run each node in a process of its own."""
     intra_process: bool = True
-    """Hand messages over within the process while nobody outside reads their topic; without, the middleware has all."""
+    """Whether messages are handed over within the process while nobody outside reads their topic, or the middleware has
+    them all."""
     headless: bool = False
     """Show no live view."""
     record: FolderPath = None

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import tyro
 
 from mujoban_core.bodies import BALL
-from mujoban_core.program import exit_status
+from mujoban_core.program import exit_status, read_options
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags.training import episodes, open_training_bag
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -24,11 +27,17 @@ from mujoban_sokoban.levels import Level
 TOPICS = (topics.TRUE_EPISODE, topics.POSE, topics.TORQUE)
 
 
-def main(arguments: Sequence[str]) -> int:
+@dataclass(frozen=True)
+class Options:
     """Play every episode of a bag again and say how far the robot is from where it was recorded."""
-    if len(arguments) != 1:
-        raise ValueError(f"{len(arguments)} arguments, expected one: the path of a bag")
-    bag = open_training_bag(Path(arguments[0]), TOPICS)
+
+    bag: Annotated[Path, tyro.conf.Positional]
+    """What was recorded."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the example."""
+    bag = open_training_bag(read_options(Options, arguments, "replay_a_bag.py").bag, TOPICS)
     body, name = bag.about.get("body", BALL.name), bag.about.get("world", DEFAULT_WORLD)
     for ticks in episodes(bag, TOPICS):
         spec = EpisodeSpec(Level.from_text(ticks[0][0].level), ticks[0][0].seed)

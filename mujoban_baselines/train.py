@@ -37,6 +37,7 @@ from mujoban_baselines.networks import RecurrentAgent
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_core.bodies import get_body
 from mujoban_core.program import read_options, run_command
+from mujoban_core.ranges import check_counts, check_positive
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
@@ -61,6 +62,12 @@ class RunConfig:
     cpu_seconds: float = 1e9
     """CPU seconds of all its processes at which it is complete, if its steps have not come first."""
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Reject a budget of nothing and what is no seed."""
+        check_counts(self, "steps")
+        check_positive(self, "cpu_seconds")
+        check_counts(self, "seed", least=0)
 
     @property
     def budget(self) -> Budget:

@@ -66,6 +66,7 @@ class Options:
 
     def __post_init__(self) -> None:
         """Reject what cannot be judged."""
+        get_body(self.body)  # refuses one that there is not
         if self.episodes < 1:
             raise ValueError(f"--episodes {self.episodes}: expected at least 1")
         if seed_range(self.seed, self.episodes) == "training":

@@ -106,6 +106,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         """Reject settings that contradict each other."""
         check_counts(self, "steps")
+        check_counts(self, "seed", least=0)
         check_positive(self, "cpu_seconds", "horizon_seconds")
         if self.teacher is not None and self.stage != "distil":
             raise ValueError(f"--teacher {self.teacher}: only the stage distil has a teacher, not {self.stage}")

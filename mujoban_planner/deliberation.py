@@ -57,7 +57,8 @@ class Deliberation:
         ):
             given = getattr(self, name)
             if given is not None and not least <= given <= most:
-                raise ValueError(f"{name} is {given}: expected {least} to {most}")
+                option = name if name in ("thinking", "look_ahead") else f"look_ahead_{name}"
+                raise ValueError(f"{option} is {given}: expected {least} to {most}")
 
     def evaluations(self, source: str = LEARNED) -> int:
         """Return the evaluations of the search by a planner from a source, as `Choice.source` names it."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mujoban_core.ranges import check_not_negative, check_positive, check_shares
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import beginning
@@ -66,6 +66,7 @@ class LearnerConfig(NetworkConfig):
     def __post_init__(self) -> None:
         """Reject networks of nothing, and what is no rate, no share and no thinking time."""
         NetworkConfig.__post_init__(self)
+        check_counts(self, "seed", least=0)
         check_positive(self, "learning_rate")
         check_not_negative(self, "weight_decay", "plan_weight", "value_weight", "push_weight", "dead_weight")
         check_shares(self, "warm_up", "ema")

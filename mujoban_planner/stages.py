@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from mujoban_core.files import write_atomically
-from mujoban_core.ranges import check_positive
+from mujoban_core.ranges import check_counts, check_positive
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.growth import beginning
 from mujoban_planner.imitation import ImitationConfig, imitation
@@ -117,6 +117,7 @@ class StagesConfig(NetworkConfig):
     def __post_init__(self) -> None:
         """Reject networks of nothing, budgets of nothing, and what is no method or no share."""
         super().__post_init__()
+        check_counts(self, "seed", least=0)
         check_positive(self, "cpu_seconds")
         _ = self.parsed
 

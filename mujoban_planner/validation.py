@@ -54,10 +54,11 @@ class NetworkConfig:
     repeats: int = 3
     """Repeats of the ConvLSTM layers (recurrent)."""
     propagation: bool = True
-    """Spread over the board by the rules where the robot can walk and boxes be pushed; the paper's network does not."""
+    """Whether it spreads over the board by the rules where the robot can walk and boxes be pushed, which the paper's
+    network does not."""
 
     judge: bool = True
-    """Judge each push where the box is (with propagation)."""
+    """Whether it judges each push where the box is (with propagation)."""
 
     def __post_init__(self) -> None:
         """Reject networks of nothing."""

@@ -50,7 +50,7 @@ class CurveOptions:
     """Which curves are drawn."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Run directories."""
+    """Run directories, at least one."""
     names: tuple[str, ...] = ()
     """What each run is, for the legend; its folder's name where nothing is given."""
     out: Path = Path("curve.png")
@@ -61,7 +61,9 @@ class CurveOptions:
     """CPU minutes from one row of the table to the next."""
 
     def __post_init__(self) -> None:
-        """Reject rows that get nowhere."""
+        """Reject nothing to draw, and rows that get nowhere."""
+        if not self.runs:
+            raise ValueError("no run is named, expected run directories")
         check_counts(self, "every_samples")
         check_positive(self, "every_minutes")
 
