@@ -229,7 +229,7 @@ class LiveNode(GraphNode):
     def _on_torque(self, stamp: int, message: JointState) -> None:
         if not self._has_named_torques:
             self._has_named_torques = True
-            self._stream.log("torque", torque_curves(message.name, len(message.effort)), static=True)
+            self._stream.log("torque", torque_curves([*message.name], len(message.effort)), static=True)
         self._stream.log("torque", rr.Scalars(np.array(message.effort)))
 
 
