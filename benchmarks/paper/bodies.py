@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import matplotlib as mpl
 
 mpl.use("Agg")
 
 import matplotlib.pyplot as plt
-from matplotlib.axes import Axes
 
-from benchmarks.paper.figures import margins, save_rates
+from benchmarks.paper.figures import draw_rates, save_rates
 from benchmarks.paper.runs import CONFIGURATIONS, SENSE, Run, load
 from mujoban_controller import camera_weights, teacher_weights
 from mujoban_core.bodies import ANT, BALL
@@ -75,18 +74,10 @@ def draw(file: Path) -> bool:
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
     for (driven, measured), aside in zip(found.items(), (-0.08, 0.0, 0.08), strict=True):
         if measured:
-            _draw_rates(axes, measured, aside, driven.title, driven.colour)
+            draw_rates(axes, measured, driven.title, driven.colour, "o", aside)
     if (learned := load(LEARNED)) is not None:
-        _draw_rates(axes, [(LEARNED, learned)], 0.16, "ant, all four modules learned", "tab:red")
+        draw_rates(axes, [(LEARNED, learned)], "ant, all four modules learned", "tab:red", "o", 0.16)
     for (body, rate), colour in zip(_PAPER.items(), ("tab:blue", "tab:orange"), strict=True):
         axes.scatter([max(DIFFICULTIES)], [rate], marker="x", color=colour, label=f"{body}, paper", zorder=3)
     save_rates(figure, axes, file)
     return True
-
-
-def _draw_rates(axes: Axes, measured: list[tuple[Run, dict[str, Any]]], aside: float, title: str, colour: str) -> None:
-    """Draw rates with their intervals, a little aside, as those of bodies are alike."""
-    bars = list(zip(*(margins(report) for _, report in measured), strict=True))
-    rates = [report["success_rate"] for _, report in measured]
-    x = [run.difficulty + aside for run, _ in measured]
-    axes.errorbar(x, rates, yerr=bars, capsize=3, marker="o", color=colour, label=title)

@@ -47,8 +47,8 @@ def difficulty(alone: Sequence[Run], ahead: Sequence[Run], file: Path) -> bool:
         return False
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
     learned = f"all four modules learned, {DEFAULT_WORLD} world,\n"
-    _stack(axes, measured_alone, f"{learned}the planner's policy alone", "tab:blue", "o", 0.0)
-    _stack(axes, measured_ahead, f"{learned}the default, with the search ahead", "tab:orange", "D", 0.08)
+    draw_rates(axes, measured_alone, f"{learned}the planner's policy alone", "tab:blue", "o", 0.0)
+    draw_rates(axes, measured_ahead, f"{learned}the default, with the search ahead", "tab:orange", "D", 0.08)
     # The first four are the stack's two colours, dark and pale.
     axes.set_prop_cycle(color=plt.get_cmap("tab20").colors[4:])  # pyright: ignore[reportAttributeAccessIssue]
     for row in BASELINES:
@@ -71,12 +71,12 @@ def _measured(runs: Sequence[Run]) -> list[tuple[Run, dict[str, Any]]]:
     return [(run, report) for run in runs if (report := load(run)) is not None]
 
 
-def _stack(
+def draw_rates(
     axes: Axes, reports: Sequence[tuple[Run, dict[str, Any]]], label: str, colour: str, marker: str, aside: float
 ) -> None:
-    """Draw a curve of the stack, a little aside; hollow points, not joined, were measured with other weights."""
+    """Draw a curve of rates, a little aside as some are alike; hollow points, not joined, are of other weights."""
     for stale in (False, True):
-        chosen = [(run, report) for run, report in reports if is_stale(report) == stale]
+        chosen = [(run, report) for run, report in reports if is_stale(report, run) == stale]
         if not chosen:
             continue
         x = [run.difficulty + aside for run, _ in chosen]
