@@ -285,7 +285,7 @@ def _cells(score: Score) -> tuple[str, ...]:
 
 
 def _settings(record: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(name, f"`{value}`") for name, value in _leaves({**record["training"], "network": record["config"]})]
+    return [(name, f"`{value}`") for name, value in _leaves({"network": None} | record["training"] | {"network": record["config"]})]
 
 
 def _numbers(tree: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
