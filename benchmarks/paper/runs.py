@@ -115,10 +115,10 @@ AHEAD: Final = (*(Run(f"default_{d}", f"difficulty {d}", d) for d in range(1, 5)
 GRAPH: Final = Run("graph", "default, through the ROS graph", further=("--graph",))
 """The headline row as users run it."""
 LOOKING_AROUND: Final = (
-    Run("look_around_none", "none", further=("--look-around", "0")),
+    Run("look_around_none", "no looking around", further=("--look-around", "0")),
     CONFIGURATIONS[0],
     Run(
-        "look_around_learned", "learned", modules=((SCOUT, ROOT / SCOUT_FOLDER / "explorer.safetensors"),),
+        "look_around_learned", "a learned scout", modules=((SCOUT, ROOT / SCOUT_FOLDER / "explorer.safetensors"),),
         training=EXPLORING,
     ),
 )
