@@ -285,7 +285,9 @@ def _cells(score: Score) -> tuple[str, ...]:
 
 
 def _settings(record: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(name, f"`{value}`") for name, value in _leaves({"network": None} | record["training"] | {"network": record["config"]})]
+    # The network is that of the weights, whatever options say that did not apply.
+    options = {name: value for name, value in record["training"].items() if name != "network"}
+    return [(name, f"`{value}`") for name, value in _leaves({"network": record["config"], **options})]
 
 
 def _numbers(tree: Mapping[str, Any]) -> Iterator[tuple[str, float]]:

@@ -152,7 +152,8 @@ def test_a_bag_is_replayed_in_the_world_that_it_names(run, oracles, tmp_path, wo
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"), [((), "missing from replay_a_bag.py: PATH"), (("none",), "no bag at none, expected a folder")]
+    ("arguments", "said"),
+    [((), "missing from replay_a_bag.py: PATH"), (("none",), "no bag at none, expected a folder")],
 )
 def test_a_bag_that_is_missing_is_one_line(run, arguments, said):
     line = run("replay_a_bag.py", *arguments)
