@@ -31,7 +31,7 @@ from mujoban_core.signals import Interrupted, StopSignal
 from mujoban_core.text import readable
 from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.memory import keep_freed_memory
-from mujoban_rl.progress import Budget, Clock, Meter, Progress
+from mujoban_rl.progress import Budget, Cadence, Clock, Meter, Progress
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.training_log import TrainingLog
 
@@ -146,35 +146,6 @@ class Source(_Part, Generic[BatchT]):
 
     def close(self) -> None:
         """End processes and close files."""
-
-
-@dataclass(frozen=True)
-class Cadence:
-    """How often a run logs, publishes, evaluates and saves."""
-
-    log_updates: int = 100
-    publish_updates: int = 10
-    evaluate_samples: float = math.inf
-    """Samples between evaluations; the end of a bit of the run is evaluated too, unless a signal asks to stop."""
-    evaluate_seconds: float = math.inf
-    """Wall-clock seconds between evaluations; 0: after every update."""
-    save_seconds: float = 120.0
-    """Wall-clock seconds between checkpoints, likewise."""
-    evaluate_first: bool = False
-    """Evaluate also what the run begins with."""
-
-    def __post_init__(self) -> None:
-        """Reject what is no distance between two of a kind."""
-        for verb, count, unit in (
-            ("log", self.log_updates, "updates"),
-            ("publish", self.publish_updates, "updates"),
-            ("evaluate", self.evaluate_samples, "samples"),
-        ):
-            if not count > 0:
-                raise ValueError(f"{verb} every {count} {unit}: expected a positive number")
-        for verb, seconds in (("evaluate", self.evaluate_seconds), ("save", self.save_seconds)):
-            if not seconds >= 0:
-                raise ValueError(f"{verb} every {seconds} seconds: expected a number of 0 or more")
 
 
 CARRIED: Final = (

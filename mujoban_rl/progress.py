@@ -1,4 +1,4 @@
-"""What a training run may spend and has spent, and the means of what it reports."""
+"""What a training run may spend and has spent, what it does how often, and the means of what it reports."""
 
 from __future__ import annotations
 
@@ -25,6 +25,35 @@ class Budget:
         for amount in fields(self):
             if not getattr(self, amount.name) > 0:
                 raise ValueError(f"budget of {getattr(self, amount.name)} {amount.name}: expected a positive number")
+
+
+@dataclass(frozen=True)
+class Cadence:
+    """How often a run logs, publishes, evaluates and saves."""
+
+    log_updates: int = 100
+    publish_updates: int = 10
+    evaluate_samples: float = math.inf
+    """Samples between evaluations; the end of a bit of the run is evaluated too, unless a signal asks to stop."""
+    evaluate_seconds: float = math.inf
+    """Wall-clock seconds between evaluations; 0: after every update."""
+    save_seconds: float = 120.0
+    """Wall-clock seconds between checkpoints, likewise."""
+    evaluate_first: bool = False
+    """Evaluate also what the run begins with."""
+
+    def __post_init__(self) -> None:
+        """Reject what is no distance between two of a kind."""
+        for verb, count, unit in (
+            ("log", self.log_updates, "updates"),
+            ("publish", self.publish_updates, "updates"),
+            ("evaluate", self.evaluate_samples, "samples"),
+        ):
+            if not count > 0:
+                raise ValueError(f"{verb} every {count} {unit}: expected a positive number")
+        for verb, seconds in (("evaluate", self.evaluate_seconds), ("save", self.save_seconds)):
+            if not seconds >= 0:
+                raise ValueError(f"{verb} every {seconds} seconds: expected a number of 0 or more")
 
 
 @dataclass
