@@ -105,7 +105,7 @@ class Choice:
         if self.source == LEARNED:
             path = self.weights or shipped_weights(self.role)
             if not path.is_file():
-                raise WeightsError(f"no weights of the {self.role} at {path}: expected a file of them, --{self.role} FILE")
+                raise WeightsError(f"no weights of the {self.role} at {path}: expected --{self.role} FILE")
             name = digest(path)
         return f"{name}{PRIVILEGED if self.told else ''}"
 

@@ -120,8 +120,8 @@ class ModuleOptions:
     """Look around before the first decision, and walk to where more can be seen: the length of each turn on the spot,
     0 for none; by default that of docs/estimator.md."""
     scout: ModuleSource = SCRIPTED
-    """What says where to look: scripted, weights of a learned one (`mujoban_planner.train explorer`; none ship), or a class
-    of your own."""
+    """What says where to look: scripted, weights of a learned one (`mujoban_planner.train explorer`; none ship), or a
+    class of your own."""
 
     look_ahead: Annotated[int | None, whole("N", 0)] = None
     """Let the learned planner search ahead by N evaluations of its network as the robot moves.
