@@ -265,14 +265,14 @@ class _Parts:
         config, n = self.config, self.config.network
         if config.initial is not None:
             policy = load_weights(VisuomotorController, config.initial, body=config.task.body)
-            check_network(n, policy.config, config.initial)
+            _check_network(n, policy.config, config.initial)
         else:
             policy = VisuomotorController(config.task.body, n.channels, n.features, n.hidden, n.place, n.way)
         policy.mixed_precision = True
         return policy.to(self.device).train()
 
 
-def check_network(asked: NetworkConfig, own: Mapping[str, Any], weights: Path) -> None:
+def _check_network(asked: NetworkConfig, own: Mapping[str, Any], weights: Path) -> None:
     """Raise a ValueError if options ask for another network than that of the weights that training begins with."""
     default = asdict(NetworkConfig())
     for name, value in asdict(asked).items():

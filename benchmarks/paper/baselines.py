@@ -26,7 +26,7 @@ from mujoban_core.files import write_atomically
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import ROLES
 from mujoban_core.program import read_options, run_command
-from mujoban_rl.metrics import COUNT, mean_of
+from mujoban_rl.metrics import mean_of
 from mujoban_sim.presets import DEFAULT_WORLD
 
 PROG: Final = "benchmarks.paper.baselines"
@@ -217,10 +217,12 @@ def read_curve(run: Path, *, cloned: bool = False) -> list[dict[str, Any]]:
         spent = ("step", "cpu_seconds", "seconds")
         point: dict[str, Any] = {kind: round((part[-1].get(kind) or 0) + before.get(kind, 0)) for kind in spent}
         for kind in KINDS:
-            means = {str(d): mean_of(part, [f"{kind}/{d}"]) for d in DIFFICULTIES}
-            point[kind] = {d: round(mean[0], 4) for d, mean in means.items() if mean is not None}
-        counts = {str(d): sum(line.get(f"{KINDS[0]}/{d}{COUNT}", 0.0) for line in part) for d in DIFFICULTIES}
-        points.append(point | {_EPISODES: {d: round(count) for d, count in counts.items() if count}})
+            found = {str(d): mean_of(part, [f"{kind}/{d}"]) for d in DIFFICULTIES}
+            means = {d: mean for d, mean in found.items() if mean is not None}
+            point[kind] = {d: round(mean, 4) for d, (mean, _) in means.items()}
+            # Of every kind the same: an episode that ends has both.
+            point[_EPISODES] = {d: round(count) for d, (_, count) in means.items()}
+        points.append(point)
     return points
 
 
