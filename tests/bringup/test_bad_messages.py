@@ -58,6 +58,7 @@ def test_spoiled_calls_of_every_service_end_nothing_and_all_are_answered(play_gr
     caller.call("/pause", SetBool.Request(data=False))
     assert graph.finish()[0].solved
     graph.spin_until(lambda: caller.answered == caller.sent)
+    assert caller.answered == caller.sent
     for name in nodes:
         assert graph.graph.nodes.get(name, graph.monitor).counts["rejected messages"] >= 1, name
 

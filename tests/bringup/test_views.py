@@ -91,7 +91,8 @@ def test_a_recording_of_the_live_view_holds_every_entity(
     file = tmp_path / "play.rrd"
     driver = {"controller": Choice("controller", weights=ant_teacher)} if body == "ant" else {}
     stack = Stack(oracles.choices | driver, body=body)
-    graph = play_graph(stack, Episodes(1, 0, difficulty=1), time_limit=25)
+    # An untrained teacher drives the ant, up to the time limit.
+    graph = play_graph(stack, Episodes(1, 0, difficulty=1), **({"time_limit": 25} if driver else {}))
     graph.graph.add(LiveNode(parameter_overrides=[Parameter("save", value=str(file))]))
     graph.finish()
     graph.__exit__(None, None, None)
