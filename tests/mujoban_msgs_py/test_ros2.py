@@ -1,7 +1,6 @@
 """The `ros2` command, run as a user runs it, against real nodes."""
 
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -28,7 +27,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter, open_bag
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.training import find_bags
-from mujoban_msgs_py.ros2.main import environment_outside, is_prepared, other_command, run
+from mujoban_msgs_py.ros2.main import run
 from mujoban_msgs_py.ros2.messages import fill, to_csv, to_yaml
 from mujoban_msgs_py.ros2.session import CommandError
 from mujoban_msgs_py.ros2.topic_measure import Bandwidth
@@ -341,36 +340,6 @@ def test_bandwidth_is_that_of_the_latest_messages():
     assert bandwidth.text(4.0) == expected
 
 
-def test_the_genuine_command_is_taken_only_if_it_knows_our_messages(tmp_path):
-    index = tmp_path / "share" / "ament_index" / "resource_index" / "packages"
-    index.mkdir(parents=True)
-    (index / "std_msgs").touch()
-    assert not is_prepared(str(tmp_path), ["topic", "list"])
-    (index / "mujoban_msgs").touch()
-    assert is_prepared(f"/nowhere:{tmp_path}", ["topic", "list"])
-    assert not is_prepared(str(tmp_path), ["bag", "info"]), "rosbag2 is missing"
-    (index / "ros2bag").touch()
-    assert is_prepared(str(tmp_path), ["bag", "info"])
-
-
-def test_the_index_of_an_installation_names_our_messages(tmp_path, monkeypatch):
-    import ament_index_python
-
-    from mujoban_msgs_py.interface_build import ament_files, generate
-
-    source = Path(conversions.__file__).parent
-    generate(source, tmp_path / "build", tmp_path / "python")
-    for folder, files in ament_files(source, tmp_path / "build"):
-        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
-        for file in files:
-            shutil.copy(file, tmp_path / folder)
-    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    content, prefix = ament_index_python.get_resource("rosidl_interfaces", "mujoban_msgs")
-    assert "msg/Instruction.msg" in content.splitlines() and prefix == str(tmp_path)
-    assert all((tmp_path / "share" / "mujoban_msgs" / line).is_file() for line in content.splitlines())
-    assert ament_index_python.get_package_share_directory("mujoban_msgs") == str(tmp_path / "share" / "mujoban_msgs")
-
-
 def test_long_arrays_are_truncated_unless_asked_for():
     message = conversions.frame_to_msg(conversions.header(1), np.zeros((64, 64, 3), np.uint8))
     assert to_yaml(message).endswith("- 0\n- '...'\n") and to_yaml(message).count("- 0\n") == 128
@@ -391,17 +360,3 @@ def test_fields_are_filled_from_nested_values():
     assert list(torque.effort) == [1.0, 0.5]
     with pytest.raises(CommandError, match="no field 'q'"):
         fill(pose, {"pose": {"q": 1}}, Time())
-
-
-def test_the_genuine_command_is_found_and_gets_a_clean_environment(tmp_path):
-    own, genuine = tmp_path / "own" / "ros2", tmp_path / "opt" / "ros2"
-    for file, text in ((own, "from mujoban_msgs_py.ros2.main import main"), (genuine, "from ros2cli import main")):
-        file.parent.mkdir()
-        file.write_text(text)
-        file.chmod(0o755)
-    assert other_command(f"{own.parent}:{genuine.parent}", own) == genuine
-    assert other_command(f"{own.parent}", Path("elsewhere")) is None
-    clean = environment_outside(
-        {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1", "LD_LIBRARY_PATH": f"{sys.prefix}/lib:/opt/ros/lib"}, Path(sys.prefix)
-    )
-    assert clean == {"LD_LIBRARY_PATH": "/opt/ros/lib"}
