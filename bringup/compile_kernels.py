@@ -5,9 +5,11 @@ What has been compiled stays in the cache until its file changes.
 
 from __future__ import annotations
 
-import sys
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from bringup.evaluate import evaluate
 from bringup.exploration import Disturbance
 from bringup.record import Job, MixedEpisodes, record
 from mujoban_core.bodies import BALL
+from mujoban_core.program import read_options, run_command
 from mujoban_planner.lesson_source import LessonActor, LessonConfig
 from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.samples import Samples, make_batch
@@ -25,7 +28,13 @@ from mujoban_rl.actors import Experience
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import TRAIN_SEEDS, VALIDATION_SEEDS
 
+PROG: Final = "bringup.compile_kernels"
 _NETWORK = NetworkConfig(channels=4, blocks=1)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compile what numba compiles."""
 
 
 def _learn_from(experience: Experience, kind: str) -> None:
@@ -43,8 +52,9 @@ def _record(folder: Path) -> None:
     record(Job(folder, "", episodes, Stack(), Disturbance(wander=1.0), batch=1, time_limit=40, run_seed=0))
 
 
-def main() -> int:
+def main(command_line: Sequence[str] | None = None) -> int:
     """Play and record a little, and make and read the planner's lessons and search for some."""
+    read_options(Options, command_line, PROG, __doc__)
     _learn_from(LessonActor(LessonConfig(levels=4), _NETWORK, 0).act(), "demonstrations")
     SearchActor(_NETWORK, SearchConfig(trees=8, expansions=8, steps=40), 0, 0).act()
     evaluate(Stack().policy(), Episodes(2, VALIDATION_SEEDS.start), time_limit=80)
@@ -60,4 +70,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(PROG, main)
