@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Unpack
 
+from mujoban_core.grid import GRID_SIZE
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter
@@ -55,15 +56,17 @@ class RecorderNode(GraphNode):
         episodes_per_file = declare(self, "episodes_per_file", 32, count)
         whose = described("whether modules give instructions; an agent alone does not", fixed=True)
         self._answers = MODULE_TOPICS if declare(self, "instructed", True, whose) else (topics.TORQUE,)
+        room = "boxes for which the world has room, for the bag to name; 0: not known"
         about = {
             "body": declare(self, "body", "", described("the robot's body, for the bag to name", fixed=True)),
             "world": declare(self, "world", "", described("the physical world, for the bag to name", fixed=True)),
+            "max_boxes": declare(self, "max_boxes", 0, described(room, fixed=True, low=0, high=GRID_SIZE**2)),
         }
         self.run = declare_run(self)
         self.counts: Counter[str] = Counter()
         self._bag = BagWriter(
             Path(path), GRAPH_TOPICS.values(), episodes_per_file=episodes_per_file, flush_after=FLUSH_AFTER,
-            about={name: value for name, value in about.items() if value},
+            about={name: str(value) for name, value in about.items() if value},
         )  # fmt: skip
         self._ticks: dict[int, dict[str, bytes]] = {}
         self._last_ticks: set[int] = set()

@@ -137,7 +137,8 @@ def play(
         stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:
-            listeners.append(graph.add(_recorder(options.record, options, stack.body, instructed=not alone)))
+            recorder = _recorder(options.record, options, stack.body, episodes.max_boxes, instructed=not alone)
+            listeners.append(graph.add(recorder))
         if options.video is not None:
             video = VideoNode(options.video, alone=alone, run=options.run, intra_process=graph.intra_process)
             listeners.append(graph.add(video))
@@ -212,9 +213,9 @@ def viewer(address: str, run: int = ANY) -> Iterator[None]:
         children.stop([process])
 
 
-def _recorder(path: Path, options: PlayOptions, body: str, *, instructed: bool) -> RecorderNode:
+def _recorder(path: Path, options: PlayOptions, body: str, max_boxes: int, *, instructed: bool) -> RecorderNode:
     values = {
         "path": str(path), "episodes_per_file": options.episodes_per_file, "body": body, "world": options.world,
-        "instructed": instructed, "run": options.run,
+        "max_boxes": max_boxes, "instructed": instructed, "run": options.run,
     }  # fmt: skip
     return RecorderNode(parameter_overrides=[Parameter(name, value=value) for name, value in values.items()])

@@ -1,7 +1,8 @@
 """Read a recorded bag tick by tick, without ROS: `python examples/replay_a_bag.py BAG`.
 
 `bringup/run_stack.py --record BAG` and `bringup/record.py` write bags; `ros2 bag play BAG` plays one back as topics.
-Here its torques are applied again to the level, body and world that it names: all is the same to the last bit.
+Here its torques are applied again to the level, body and world that it names: all is the same to the last bit, if the
+world has room for as many boxes as the one that was recorded, which older bags do not say.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ def main(arguments: Sequence[str]) -> int:
     body, name = bag.about.get("body", BALL.name), bag.about.get("world", DEFAULT_WORLD)
     for ticks in episodes(bag, TOPICS):
         spec = EpisodeSpec(Level.from_text(ticks[0][0].level), ticks[0][0].seed)
-        world = World(1, body=body, world=name, max_boxes=len(spec.level.boxes))
+        boxes = int(bag.about.get("max_boxes", len(spec.level.boxes)))
+        world = World(1, body=body, world=name, max_boxes=boxes)
         world.reset([0], [spec])
         apart = 0.0
         for _, pose, torque in ticks:

@@ -11,6 +11,8 @@ import pytest
 
 from bringup.rollout import ticks
 from bringup.rollout_recorder import Recorder
+from mujoban_baselines.random_agent import RandomAgent
+from mujoban_baselines.repeat import Repeating
 from mujoban_core.agent import OWN_SENSES, AgentInput, AgentPolicy
 from mujoban_core.bodies import BALL
 from mujoban_core.files import digest
@@ -149,6 +151,17 @@ def test_a_bag_is_replayed_in_the_world_that_it_names(run, oracles, tmp_path, wo
             recorder.write(tick)
     (bag,) = (tmp_path / "bag").iterdir()
     assert f"seed {spec.seed}: {tick.step[0] + 1} ticks, at most 0.0e+00 apart" in run("replay_a_bag.py", bag)
+
+
+def test_a_bag_is_replayed_with_room_for_as_many_boxes_as_it_was_recorded_with(run, tmp_path):
+    """The solver's steps depend on it in the last bit."""
+    spec = EpisodeSpec(generate_level(1, TRAIN_SEEDS.start), TRAIN_SEEDS.start)
+    agent = Repeating(RandomAgent(), 10, BALL.action_size)
+    with Recorder(tmp_path / "bag", BALL, [spec], [1]) as recorder:
+        for tick in ticks(AgentPolicy(agent), World(1, max_boxes=4, time_limit=200), [spec], camera=True):
+            recorder.write(tick)
+    (bag,) = (tmp_path / "bag").iterdir()
+    assert f"seed {spec.seed}: 200 ticks, at most 0.0e+00 apart" in run("replay_a_bag.py", bag)
 
 
 @pytest.mark.parametrize(
