@@ -19,6 +19,8 @@ SUBGOAL_LIMIT: Final = 50
 SUBGOAL_REWARD: Final = 0.1
 """Pseudo reward for reaching one."""
 
+_STREAM: Final = 0x5B60A1
+"""Sets their random stream apart from that of torques drawn by the same seed."""
 _MOVES: Final = tuple(direction for direction in Instruction if direction != Instruction.STAY)
 
 
@@ -30,7 +32,7 @@ class Subgoals(NamedTuple):
     age: NDArray[np.int64]
     """Steps that each has had, [B]."""
     seed: NDArray[np.int64]
-    """[B]."""
+    """Of their random streams, [B]."""
     drawn: NDArray[np.int64]
     """Subgoals so far, [B]."""
 
@@ -39,7 +41,8 @@ class Subgoals(NamedTuple):
         """Return what holds before the first tick of episodes with the given random streams, [B]."""
         b = len(seeds)
         target = np.zeros((b, GRID_SIZE, GRID_SIZE, 4), np.bool_)
-        return cls(target, np.full(b, SUBGOAL_LIMIT, np.int64), np.asarray(seeds, np.int64), np.zeros(b, np.int64))
+        streams = np.asarray(seeds, np.int64) ^ _STREAM
+        return cls(target, np.full(b, SUBGOAL_LIMIT, np.int64), streams, np.zeros(b, np.int64))
 
     def reached(self, state: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return whether abstract states, [B, N, N, 4], are the subgoals, [B]."""

@@ -6,6 +6,7 @@ import torch
 
 from mujoban_baselines import load
 from mujoban_baselines.agents import AGENTS, SIZES, MonolithicAgent, StructuredAgent
+from mujoban_baselines.drawing import Drawing
 from mujoban_baselines.networks import Recurrent
 from mujoban_baselines.subgoals import SUBGOAL_LIMIT, Subgoals, adjacent_state
 from mujoban_core.agent import AgentInput
@@ -115,6 +116,16 @@ def test_a_subgoal_holds_until_it_is_reached_or_its_time_is_up():
     assert subgoals.reached(there).all()
     following = subgoals.renewed(there)
     assert following.drawn == 2 and not following.reached(there).any()
+
+
+def test_subgoals_and_torques_are_drawn_apart():
+    """Both by the episode's seed, in play as in training."""
+    seeds = np.arange(500)
+    subgoals = Subgoals.none_yet(seeds).renewed(np.stack([ROOM] * 500))
+    pushed = (subgoals.target[..., BOX] != (ROOM[..., BOX] > 0.5)).any((1, 2))
+    noise = Drawing(StructuredAgent(draws="pink").eval(), "pink").initial_state(seeds)[-3]
+    apart = np.corrcoef(pushed, noise[:, 0, 0])[0, 1]
+    assert abs(apart) < 0.2, "1/sqrt(500) is 0.04"
 
 
 def test_a_state_without_an_agent_is_its_own_subgoal():
