@@ -5,7 +5,7 @@ Shape legend: T steps of an unroll, which holds T + 1 ticks, B robots. A tick is
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,10 +29,13 @@ from mujoban_rl.weights import save_weights
 
 @dataclass(frozen=True)
 class VTraceTrainingConfig:
-    """Settings of V-trace; those of its loss are IMPALA's."""
+    """Settings of V-trace (Espeholt et al. 2018)."""
 
     unroll: int = 20
     """T, in decisions of the agent."""
+    batch: int = 8
+    """Robots of whose unrolls each step of the optimiser learns, of all that have played until each has had its turn.
+    The later steps' weights are newer than those that played, which importance weights correct for."""
     gamma: float = 0.99
     rate: float = 3e-4
     """Learning rate; it falls to 0 along a line."""
@@ -50,8 +53,8 @@ class VTraceTrainingConfig:
     loss: VTraceConfig = field(default_factory=VTraceConfig)
 
     def __post_init__(self) -> None:
-        """Reject unrolls without a step, and numbers out of their range."""
-        check_counts(self, "unroll")
+        """Reject unrolls without a step, batches of nobody, and numbers out of their range."""
+        check_counts(self, "unroll", "batch")
         check_shares(self, "gamma")
         check_positive(self, "gamma", "rate", "clip")
         check_not_negative(self, "auxiliary", "beyond")
@@ -98,6 +101,19 @@ class VTraceLearner(Learner[Arrays]):
         self._schedule.follow(progress)
         # Shape [B, T + 1, ...].
         ticks = {name: torch.from_numpy(values).transpose(0, 1) for name, values in batch.items()}
+        told = [self._learn(dict(zip(ticks, part, strict=True)), guard) for part in self._parts(ticks)]
+        taken = [scalars for scalars in told if scalars]
+        if not taken:
+            return {}
+        self._normalise(ticks["proprio"][:, 0])
+        return {name: sum(scalars[name] for scalars in taken) / len(taken) for name in taken[0]}
+
+    def _parts(self, ticks: Mapping[str, Tensor]) -> Iterator[tuple[Tensor, ...]]:
+        """Yield the unrolls of so many robots at a time as a step learns from."""
+        return zip(*(values.split(self.config.batch) for values in ticks.values()), strict=True)
+
+    def _learn(self, ticks: Mapping[str, Tensor], guard: NaNGuard) -> dict[str, float]:
+        """Take a step on some robots' unrolls, [B, T + 1, ...] each; return what to log, nothing if it was refused."""
         output = self.agent({name: ticks[name] for name in self.agent.reads}, memory_of(ticks), ticks["first"])
         log_prob = output.action.limited_log_prob(ticks["action"])
         entropy = Normal(*output.action, validate_args=False).entropy().sum(-1)
@@ -123,7 +139,6 @@ class VTraceLearner(Learner[Arrays]):
         norm = guarded_step(loss, [self._adam], guard, clip=self.config.clip)
         if norm is None:
             return {}
-        self._normalise(ticks["proprio"][:, 0])
         scale = float(output.action.scale.detach().mean())
         return {**named, "vtrace/scale": scale, "gradient_norm": float(norm)}
 

@@ -17,7 +17,7 @@ from mujoban_core.ranges import check_not_negative, check_positive
 
 @dataclass(frozen=True)
 class VTraceConfig:
-    """Truncation of importance weights, and weights of the loss's terms (IMPALA's defaults)."""
+    """Truncation of importance weights, by default as in IMPALA, and weights of the loss's terms."""
 
     clip_rho: float = 1.0
     """Bound of the weights in the temporal differences: which policy the values are of."""

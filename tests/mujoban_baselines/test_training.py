@@ -77,6 +77,25 @@ def test_v_trace_goes_on_with_more_or_fewer_actors_from_one_unroll_of_each(tmp_p
     assert shapes == [(4, 4)] * 4 + [(4, 2)] * 4 + [(4, 6)] * 4
 
 
+@pytest.mark.parametrize(("batch", "steps"), [(1, 5), (2, 3), (8, 1)])
+def test_v_trace_learns_from_so_many_robots_at_a_time_until_each_had_its_turn(batch, steps, monkeypatch):
+    seen, learn = [], VTraceLearner._learn
+
+    def noted(learner, ticks, guard):
+        seen.append(ticks["action"][:, 0].numpy())
+        return learn(learner, ticks, guard)
+
+    monkeypatch.setattr(VTraceLearner, "_learn", noted)
+    config = VTraceRunConfig(task=TaskConfig(robots=5), vtrace=VTraceTrainingConfig(unroll=2, batch=batch))
+    learner, source = vtrace_parts(config, TopDownAgent, ActorOptions(), partial(SquaresTask, batch=5))
+    source.publish(learner.weights(), 0)
+    played = source.next_batch()
+    told = learner.update(played, 0.0, NaNGuard())
+    assert len(seen) == steps and np.array_equal(np.concatenate(seen), played["action"][0])
+    (state,) = {int(state["step"]) for state in learner.optimisers["adam"].state.values()}
+    assert state == steps and math.isfinite(told["vtrace/value_loss"])
+
+
 class Blank(Critic):
     """Holds every action to be worth nothing."""
 
