@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 import torch
@@ -166,18 +166,24 @@ Parts = tuple[Learner[Any], Source[Any]]
 """What a trainer drives."""
 
 
-def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | None = None) -> Parts:
-    """Return learner and source of monolithic MPO (paper D.1), on Mujoban or on a task of one's own."""
+def mpo_parts(
+    config: MPORunConfig, actors: ActorOptions, task: TaskFactory | None = None,
+    kind: type[RecurrentAgent] = MonolithicAgent,
+) -> Parts:  # fmt: skip
+    """Return learner and source of MPO (paper D.1) with an agent of a kind, on Mujoban or on a task of one's own."""
     torch.manual_seed(config.seed)  # the initial weights
     body, mpo = config.task.body, config.mpo
+    sizes = {"size": config.size} if kind is MonolithicAgent else {}
+    if not sizes and config.size != MPORunConfig.size:
+        raise ValueError(f"--size {config.size}: {kind.__name__} has no sizes")
     if config.start is None:
-        agent = MonolithicAgent(body, config.size, **config.play)
+        agent = kind(body, **sizes, **config.play)  # pyright: ignore[reportCallIssue]
     else:
-        agent = load_weights(MonolithicAgent, config.start, body=body).train()
-        for name in ("size", "repeat", "draws"):
+        agent = load_weights(kind, config.start, body=body).train()
+        for name in (*sizes, "repeat", "draws"):
             if (held := agent.config.get(name)) != (asked := getattr(config, name)):
                 raise ValueError(f"--{name} {asked}: {config.start} holds weights of {name} {held}, expected that")
-    build = partial(MonolithicAgent, **agent.config)
+    build = partial(kind, **agent.config)
     critic: Critic = AsymmetricCritic(body) if config.critic == "asymmetric" else SymmetricCritic(body, agent.width)
     streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(2)]
     generators = [torch.Generator().manual_seed(seed) for seed in streams]
@@ -190,7 +196,7 @@ def mpo_parts(config: MPORunConfig, actors: ActorOptions, task: TaskFactory | No
 
 
 def vtrace_parts(
-    config: VTraceRunConfig, kind: type[TopDownAgent], actors: ActorOptions, task: TaskFactory | None = None
+    config: VTraceRunConfig, kind: type[RecurrentAgent], actors: ActorOptions, task: TaskFactory | None = None
 ) -> Parts:
     """Return learner and source of V-trace with an agent of a kind (paper D.2)."""
     torch.manual_seed(config.seed)  # the initial weights
@@ -272,14 +278,20 @@ class _ActorCommand(_Command):
 
 @dataclass(frozen=True)
 class MonolithicMPO(_ActorCommand):
-    """Monolithic RL: camera, proprioception and pose to torques, by MPO (paper D.1)."""
+    """Monolithic RL: camera, proprioception and pose to torques, by MPO (paper D.1).
+
+    A subclass of this or of `MonolithicVTrace` trains another `kind` of agent, under a `method`'s name of its own.
+    """
+
+    kind: ClassVar[type[RecurrentAgent]] = MonolithicAgent
+    method: ClassVar[str] = "monolithic-mpo"
 
     config: Annotated[MPORunConfig, tyro.conf.arg(name="")] = field(default_factory=MPORunConfig)
 
     def trainer(self) -> Trainer[Any]:
         """Make or resume the run."""
-        parts, start = mpo_parts(self.config, self.actors), origin(self.config.start)
-        return make_trainer(self.config, parts, self.run, self.cadence(**MPO_PACE), "monolithic-mpo", start=start)
+        parts, start = mpo_parts(self.config, self.actors, kind=self.kind), origin(self.config.start)
+        return make_trainer(self.config, parts, self.run, self.cadence(**MPO_PACE), self.method, start=start)
 
 
 @dataclass(frozen=True)
@@ -304,24 +316,23 @@ class Clone(_Command):
 class MonolithicVTrace(_ActorCommand):
     """Fully observable monolithic RL: view from above and proprioception to torques, by V-trace (paper D.2)."""
 
+    kind: ClassVar[type[RecurrentAgent]] = TopDownAgent
+    method: ClassVar[str] = "monolithic-vtrace"
+
     config: Annotated[VTraceRunConfig, tyro.conf.arg(name="")] = field(default_factory=VTraceRunConfig)
 
     def trainer(self) -> Trainer[Any]:
         """Make or resume the run."""
-        parts = vtrace_parts(self.config, TopDownAgent, self.actors)
-        return make_trainer(self.config, parts, self.run, self.cadence(20, 1), "monolithic-vtrace")
+        parts = vtrace_parts(self.config, self.kind, self.actors)
+        return make_trainer(self.config, parts, self.run, self.cadence(20, 1), self.method)
 
 
 @dataclass(frozen=True)
-class StructuredVTrace(_ActorCommand):
+class StructuredVTrace(MonolithicVTrace):
     """Fully observable structured RL: also the abstract state, and pseudo rewards for adjacent ones (paper D.2)."""
 
-    config: Annotated[VTraceRunConfig, tyro.conf.arg(name="")] = field(default_factory=VTraceRunConfig)
-
-    def trainer(self) -> Trainer[Any]:
-        """Make or resume the run."""
-        parts = vtrace_parts(self.config, StructuredAgent, self.actors)
-        return make_trainer(self.config, parts, self.run, self.cadence(20, 1), "structured-vtrace")
+    kind: ClassVar[type[RecurrentAgent]] = StructuredAgent
+    method: ClassVar[str] = "structured-vtrace"
 
 
 @dataclass(frozen=True)
@@ -347,9 +358,12 @@ COMMANDS: dict[str, type[_Command]] = {
 }
 
 
-def main(command_line: Sequence[str] | None = None, prog: str = PROG) -> int:
-    """Run the command line."""
-    command = read_options(COMMANDS, command_line, prog, __doc__)
+def main(
+    command_line: Sequence[str] | None = None, prog: str = PROG,
+    kinds: type[_Command] | Mapping[str, type[_Command]] = COMMANDS,
+) -> int:  # fmt: skip
+    """Run a command line of one of these kinds of training, or of the only one."""
+    command = read_options(kinds, command_line, prog, __doc__ if kinds is COMMANDS else None)
     set_threads(command.threads)
     command.trainer().run(limit_seconds=command.seconds)
     return 0

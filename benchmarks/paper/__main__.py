@@ -53,8 +53,10 @@ paper trained them for up to 21 days with 1,000 actors (fully observable) and 5 
 and reports the best of many settings; here steps and CPU hours are what the row was given.
 """
 BUDGETS = f"""Rows trained on nothing are the floor. Every other one but that of the stack as it ships is given the
-environment steps of the modular row and its {HOURS:g} h of two cores, whichever is spent first. Not counted are the
-recording of what is cloned, and the weights of the stack that ships where a row begins with them.
+environment steps of the modular row and its {HOURS:g} h of two cores, whichever is spent first: rows of less than
+{2 * HOURS:g} CPU hours were ended by their steps. To learn from each of them more often brought MPO there sooner, [not
+further](../research/baselines.md#torques-that-are-held). Not counted are the recording of what is cloned, and the
+weights of the stack that ships where a row begins with them.
 `python -m benchmarks.paper.table1` trains and evaluates one row after the other, and goes on where it was stopped. Its
 commands are
 """

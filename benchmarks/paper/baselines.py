@@ -47,6 +47,8 @@ _CLONED: Final = 1 / 3
 """Share of a row's budget that its cloning takes, where it learns by itself after that."""
 _START: Final = "_start"
 """Ends the run directory of such a cloning."""
+_WHOLE: Final = "bringup.train_all"
+"""Trains the whole stack, within hours."""
 RECORDING: Final = (
     "python bringup/record.py --out bags/stack --undisturbed --advanced 0 --time-limit 0 --episodes 512"
 )
@@ -70,6 +72,7 @@ class Baseline:
     roles: tuple[str, ...] = ()
     """Modules that it leaves, in the place of an agent; they play with those that ship, without a search ahead."""
     program: str = "mujoban_baselines.train"
+    """Trains it; empty: it plays without having been trained."""
     cloning: str = ""
     """Arguments of a cloning of whose weights it begins, which takes `_CLONED` of its budget."""
     weights: str = ""
@@ -77,7 +80,7 @@ class Baseline:
     seed: int = 0
     """Of the run; with another one, the same is trained once more."""
     agent: str = ""
-    """Name of an agent that plays without having been trained."""
+    """Name of the agent that plays, where it is not the weights of its run that do."""
     guide: str = ""
     """Page that says how it is trained, seen from that of the results."""
 
@@ -94,10 +97,10 @@ class Baseline:
     @property
     def commands(self) -> tuple[str, ...]:
         """The commands that train it, one after the other."""
-        if self.agent:
+        if not self.program:
             return ()
         run = f"runs/baselines/{self.name}"
-        if self.program != "mujoban_baselines.train":
+        if self.program == _WHOLE:
             return (f"python -m {self.program} {self.method} --hours {HOURS:g} --run {run}",)
         if not self.cloning:
             return (self._trains(self.method, 1.0, run),)
@@ -110,7 +113,7 @@ class Baseline:
         # The learner and the robots each have a core, as the stages of the modular row have both.
         actors = "" if method.startswith("clone") else " --actors processes --num-actors 1"
         budget = f"--steps {steps() * share:.0f} --cpu-seconds {2 * 3600 * HOURS * share:.0f}"
-        return f"python -m {self.program} {method}{seed} {budget}{actors} --run {run}"
+        return " ".join(f"python -m {self.program} {method}{seed} {budget}{actors} --run {run}".split())
 
     def again(self, seed: int) -> Baseline:
         """Return the same row with another seed."""
@@ -151,15 +154,15 @@ _VTRACE: Final = "--repeat 4 --draws pink --vtrace.exploration pink"
 """The same for V-trace, whose own noise is white."""
 MODULAR: Final = Baseline(
     "modular", "modular", _ROBOT, "all difficulties, bottom-up", f"--world {DEFAULT_WORLD}",
-    "7 days, 200 to 1,000 actors a module", tuple(ROLES), "bringup.train_all", weights="weights",
+    "7 days, 200 to 1,000 actors a module", tuple(ROLES), _WHOLE, weights="weights",
     guide="../weights.md",
 )  # fmt: skip
 """The stack, from nothing within the same hours."""
 BASELINES: Final = (
     MODULAR,
-    Baseline("random", "even torques, each tick anew", "nothing", "nothing", "", _NOT, agent="random"),
+    Baseline("random", "even torques, each tick anew", "nothing", "nothing", "", _NOT, program="", agent="random"),
     Baseline(
-        "untrained", "MPO untrained: its noise, pink, held for 4 ticks", _ROBOT, "nothing", "", _NOT,
+        "untrained", "MPO untrained: its noise, pink, held for 4 ticks", _ROBOT, "nothing", "", _NOT, program="",
         agent="mujoban_baselines.agents:untrained",
     ),
     Baseline("mpo_hard", "MPO, asym.", _ROBOT, "hard", _MPO, _PARTIAL),
@@ -183,7 +186,7 @@ BASELINES: Final = (
 """The stack, what nobody has trained, the agents of appendix D, a monolithic one that may copy, and the stack
 fine-tuned for the task's reward."""
 JOINT: Final = BASELINES[-1]
-AGAIN: Final = tuple(baseline.again(1) for baseline in BASELINES[1:] if not baseline.agent)
+AGAIN: Final = tuple(baseline.again(1) for baseline in BASELINES[1:] if baseline.program and not baseline.agent)
 """The agents once more, with another seed; they are shown where they were measured."""
 RUNS: Final = tuple(baseline.run(d) for baseline in (*BASELINES, *AGAIN) for d in DIFFICULTIES)
 """Their evaluations."""
@@ -195,6 +198,11 @@ class Options:
 
     runs: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="NAME=RUN")]
     """Names of baselines and their run directories."""
+
+    def __post_init__(self) -> None:
+        """Reject nothing to note."""
+        if not self.runs:
+            raise ValueError("NAME=RUN is missing: expected rows of Table 1 with their run directories")
 
 
 def read_curve(run: Path, *, cloned: bool = False) -> list[dict[str, Any]]:
@@ -275,7 +283,7 @@ def points_of(baseline: Baseline) -> list[dict[str, Any]]:
 
 def note(given: Sequence[str]) -> None:
     """Write the curves of runs, given as NAME=RUN."""
-    known = {baseline.name: baseline for baseline in (*BASELINES, *AGAIN) if not baseline.agent}
+    known = {baseline.name: baseline for baseline in (*BASELINES, *AGAIN) if baseline.program}
     for text in given:
         name, equals, run = text.partition("=")
         if not equals or name not in known:

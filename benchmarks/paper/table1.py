@@ -79,8 +79,8 @@ def _trainings(baseline: Baseline) -> Iterator[Stage]:
     for command in commands:
         folder = Path(command[command.index("--run") + 1])
         # What the last one makes is what plays; one before it makes an agent to start from.
-        last = command is commands[-1]
-        products = tuple(baseline.run(1).own.values()) if last else (folder / "agent.safetensors",)
+        played = tuple(baseline.run(1).own.values()) if command is commands[-1] else ()
+        products = played or (folder / "agent.safetensors",)
         yield Stage(folder.name, tuple(command), products, needs, HOURS * 3600.0, _BOTH)
         needs = (folder.name,)
 

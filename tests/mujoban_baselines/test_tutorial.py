@@ -2,14 +2,19 @@
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from benchmarks.paper import baselines, table1
 from bringup.evaluate import evaluate
-from mujoban_baselines.train import COMMANDS
+from mujoban_baselines.mpo import MPOTrainingConfig
+from mujoban_baselines.task import TaskConfig
+from mujoban_baselines.train import COMMANDS, MPORunConfig, main, mpo_parts
 from mujoban_core.agent import AgentPolicy
 from mujoban_core.plugins import load_module
+from mujoban_rl.actors import ActorOptions
 from mujoban_sokoban.episodes import Episodes
 
 GUIDE = (Path(__file__).parents[2] / "docs" / "baselines.md").read_text()
@@ -19,8 +24,7 @@ GUIDE = (Path(__file__).parents[2] / "docs" / "baselines.md").read_text()
 def modules(tmp_path, monkeypatch):
     codes = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)
     names = ("my_agent", "my_map_agent")
-    chaser, network, loading = codes
-    for name, code in zip(names, (chaser, f"{network}\n\n{loading}"), strict=True):
+    for name, code in zip(names, codes, strict=True):
         (tmp_path / f"{name}.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     yield names
@@ -39,12 +43,37 @@ def test_the_agent_that_learns_does_so_on_the_engine_and_plays(modules, tmp_path
     from importlib import import_module
 
     monkeypatch.chdir(tmp_path)
-    trainer = import_module("my_map_agent").trainer(Path("runs/map_agent"), steps=700)
-    assert trainer.run()
-    assert trainer.progress.updates >= 2
+    (command,) = re.findall(r"python my_map_agent.py (.*)", GUIDE)
+    options = [*command.replace("--steps 500000", "--steps 700").split(), "--robots", "4"]
+    assert main(options, kinds=import_module("my_map_agent").TrainMapAgent) == 0
+    assert '"updates": 3' in Path("runs/baselines/map_agent/metrics.jsonl").read_text()
     agent = load_module("agent", "my_map_agent:trained")
+    assert agent.ticks == 4 and agent.inner.inner.draws == "pink", "it plays as it was trained to"
     (result,) = evaluate(AgentPolicy(agent), Episodes(1, 0, difficulty=1), time_limit=20)
     assert result.steps == 20 and agent.privileged
+
+
+def test_either_learner_takes_the_agent_of_the_tutorial(modules, tmp_path):
+    from importlib import import_module
+
+    kind = import_module("my_map_agent").MapAgent
+    config = MPORunConfig(task=TaskConfig(robots=2), repeat=4, mpo=MPOTrainingConfig(window=8, warm_up=1))
+    learner, source = mpo_parts(config, ActorOptions(), kind=kind)
+    source.close()
+    assert isinstance(learner.agent, kind) and learner.agent.repeat == 4
+    with pytest.raises(ValueError, match="--size L: MapAgent has no sizes"):
+        mpo_parts(replace(config, size="L"), ActorOptions(), kind=kind)
+
+
+def test_the_row_of_the_tutorial_is_trained_by_its_program_and_played_by_its_agent(tmp_path):
+    (text,) = re.findall(r'    Baseline\(\n        "map_agent".*?\n    \)', GUIDE, re.DOTALL)
+    row = eval(text.strip(), vars(baselines))
+    train, note, levels = table1.stages(row)
+    assert train.command[:4] == ("-m", "my_map_agent", "--levels", "easy")
+    assert train.command[-2:] == ("--run", "runs/baselines/map_agent") and "--cpu-seconds" in train.command
+    assert train.products == (Path("runs/baselines/map_agent/agent.safetensors"),)
+    assert note.products == (row.curve,) and levels.needs == (train.name, note.name)
+    assert row.run(5).further == ("--agent", "my_map_agent:trained")
 
 
 def test_every_command_of_the_guide_is_one():
