@@ -256,6 +256,8 @@ class Trainer(Generic[BatchT]):
         spent = True
         if not self.complete:
             self._publish(again=True)
+        else:
+            say(f"{self.directory.path}: complete after {readable(progress.samples)} samples; nothing is left to do")
         while not self.complete:
             if stop.requested or limits.reached(progress):
                 spent = False
