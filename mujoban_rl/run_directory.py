@@ -83,6 +83,8 @@ class RunDirectory:
             stored = _overlaid(_defaults(config), fixed | _read_config(file))
             changed = sorted(k for k in stored.keys() | self.config.keys() if stored.get(k) != self.config.get(k))
             if changed:
+                # What else there is belongs to the one method or the other.
+                changed = ["method"] if "method" in changed else changed
                 pairs = ", ".join(f"{k}: {stored.get(k)!r} there, {self.config.get(k)!r} now" for k in changed)
                 raise RunError(f"{self.path}: a run with another configuration ({pairs}); {_ANOTHER}")
         elif self._checkpoints():
