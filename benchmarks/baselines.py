@@ -20,6 +20,7 @@ from benchmarks.command import run_benchmark
 from benchmarks.paper.baselines import BASELINES
 from mujoban_baselines.train import COMMANDS, MPO_PACE, MonolithicMPO, MPORunConfig, mpo_parts
 from mujoban_core.program import read_options
+from mujoban_core.ranges import check_positive
 from mujoban_core.threads import set_threads
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.limits import NaNGuard
@@ -94,6 +95,10 @@ class Options:
 
     seconds: float = 30.0
     """For each setting."""
+
+    def __post_init__(self) -> None:
+        """Reject a time that never comes."""
+        check_positive(self, "seconds")
 
 
 if __name__ == "__main__":
