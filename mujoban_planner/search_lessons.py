@@ -85,6 +85,8 @@ class SearchConfig(LevelConfig, UncertaintyConfig):
         check_counts(self, "trees", "expansions", "steps", "buffer", "batch_size")
         check_counts(self, "questions", "retries", "lead", "verdicts", least=0)
         check_shares(self, "retried", "walks", "led", "judged", "easy")
+        if self.buffer < self.batch_size:
+            raise ValueError(f"buffer is {self.buffer}: expected at least a batch of {self.batch_size}")
 
 
 @dataclass
@@ -306,7 +308,9 @@ class LessonStore:
         parts = [ways.draw(size - judged, self._rng)]
         if judged:
             parts.append(verdicts.draw(judged, self._rng))
-        batch = make_batch(concatenate(parts), self._rng.integers(0, SYMMETRIES, size))
+        # What is blurred and hidden are the first and the last of a batch: states of both kinds, hence.
+        samples = concatenate(parts).take(self._rng.permutation(size))
+        batch = make_batch(samples, self._rng.integers(0, SYMMETRIES, size))
         return batch._replace(state=self._uncertainty.apply(batch.state, self._generator, self._rng))
 
     def state(self) -> State:

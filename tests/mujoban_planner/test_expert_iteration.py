@@ -84,6 +84,21 @@ def test_learning_waits_until_searches_have_taught_enough(lessons):
     assert sampled is not None and len(sampled.state) == batch
 
 
+def test_states_of_both_kinds_are_blurred_and_hidden(lessons):
+    store = LessonStore(SMALL, 0)
+    arrays = {f"{kind}.{name}": x for kind, samples in lessons.items() for name, x in samples._asdict().items()}
+    store.add(Experience(arrays, 1, {}))
+    blurred, hidden = int(SMALL.batch_size * SMALL.noise), int(SMALL.batch_size * SMALL.hidden)
+    right = torch.stack([store.sample().right.any(1) for _ in range(20)])
+    for part in (right[:, :blurred], right[:, -hidden:]):
+        assert part.any() and not part.all(), "only states of ways say what is right"
+
+
+def test_a_buffer_holds_a_batch():
+    with pytest.raises(ValueError, match="buffer is 100: expected at least a batch of 256"):
+        SearchConfig(buffer=100)
+
+
 def test_of_the_lessons_those_are_kept_in_which_the_planner_errs():
     erred = {}
     for easy in (0.0, 1.0):
