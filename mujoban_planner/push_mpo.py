@@ -200,8 +200,10 @@ class PushReplay(ReplayStore[Window]):
                 self.replay.add(sequence)
         self._after[actor] = {name: arrays[f"last_{name}"].copy() for name in BOARDS}
 
-    def sample(self) -> Window:
-        """Return windows of n + 1 successive steps."""
+    def sample(self) -> Window | None:
+        """Return windows of n + 1 successive steps, once an actor has played a whole sequence."""
+        if not len(self.replay):
+            return None
         return self.replay.sample(self.config.batch_size, self.generator, self.config.n_step + 1)
 
     def parts(self) -> dict[str, State]:

@@ -149,8 +149,8 @@ class ReplayStore(ABC, Generic[BatchT]):
         self.replay.add(experience.arrays)
 
     @abstractmethod
-    def sample(self) -> BatchT:
-        """Return a batch to learn from."""
+    def sample(self) -> BatchT | None:
+        """Return a batch to learn from, or None as long as there is too little for one."""
 
     def parts(self) -> dict[str, State]:
         """Return all that changes, by name."""

@@ -176,6 +176,16 @@ def test_a_replay_goes_on_with_more_or_fewer_actors():
     assert len(fewer.replay) == len(replay.replay) and fewer.sample()["wall"].min() > 0
 
 
+def test_learning_waits_until_an_actor_has_played_a_whole_sequence():
+    config = PushMPOConfig(play=PLAY, batch_size=4, replay_steps=8, n_step=3, **SIZE)
+    replay = PushReplay(config, 2)
+    for actor in (0, 1):
+        deliver(replay, 5, 1, actor=actor)
+        assert replay.sample() is None, "7 steps make a sequence, of which each actor has played 4"
+    deliver(replay, 5, 2)
+    assert len(replay.sample()["target"]) == 4
+
+
 @pytest.mark.parametrize("make", [ppo, mpo])
 def test_a_run_from_weights_keeps_what_they_say_in_heads_that_it_does_not_teach(make, tmp_path):
     start = ResidualPlanner(8, 1, judge=True)
