@@ -180,7 +180,7 @@ def train_stages(
         judging = replace(cadence, evaluate_first=cadence.evaluate_first or init is not None)
         trainer = METHODS[method](settings, _Place(folders[-1], judging, actors, device))
         product = folders[-1] / _PRODUCT
-        if trainer.complete and product.exists():
+        if trainer.complete and trainer.judged and product.exists():
             trainer.source.close()
         elif not trainer.run(limit_seconds=None if seconds is None else max(seconds - time.elapsed, 0.0)):
             return False

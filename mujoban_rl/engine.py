@@ -199,6 +199,11 @@ class Trainer(Generic[BatchT]):
         """Whether the budget is spent."""
         return self.progress.share(self.budget) >= 1.0
 
+    @property
+    def judged(self) -> bool:
+        """Whether no evaluation is due, such as one that a signal cut short."""
+        return not self._due
+
     def run(
         self,
         *,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import torch
 
 from mujoban_core.files import digest
 from mujoban_core.grid import GRID_SIZE
+from mujoban_core.signals import Interrupted
 from mujoban_planner import load, stages, train
 from mujoban_planner.push_actor import PlayConfig
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
@@ -104,6 +107,33 @@ def test_a_run_goes_on_with_the_stage_that_was_stopped(tmp_path: Path, started: 
     assert digest(tmp_path / "1_ppo" / "planner.safetensors") == first
     with pytest.raises(RunError):
         train_stages(StagesConfig(stages=("ppo=1",)), tmp_path, OFTEN, ActorOptions())
+
+
+def test_a_stage_whose_last_evaluation_was_cut_short_is_judged_when_the_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: list[Any]
+) -> None:
+    judged: list[str] = []
+
+    def interrupted(method: Any) -> Any:
+        def make(settings: Any, place: Any) -> Trainer[Any]:
+            trainer = method(settings, place)
+
+            def judge() -> dict[str, float]:
+                judged.append(place.run.name)
+                if len(judged) == 1:
+                    os.kill(os.getpid(), signal.SIGTERM)
+                return {}
+
+            trainer.learner.evaluate = judge
+            return trainer
+
+        return make
+
+    monkeypatch.setattr(stages, "METHODS", {name: interrupted(method) for name, method in stages.METHODS.items()})
+    with pytest.raises(Interrupted):
+        train_stages(CONFIG, tmp_path, OFTEN, ActorOptions())
+    assert train_stages(CONFIG, tmp_path, OFTEN, ActorOptions())
+    assert judged[:2] == ["1_ppo", "1_ppo"] and set(judged[2:]) == {"2_mpo-pushes"}
 
 
 def small_planner(path: Path, *, blocks: int = 2) -> Path:
