@@ -214,6 +214,11 @@ class LearnedPlanner(Compilable, Planner):
         return Weighed(score, push, push_alive, advice.alive[:, Instruction.STAY])
 
     @property
+    def rereads(self) -> bool:
+        """Whether `read`, and with it a search ahead, depends on the thinking time."""
+        return True
+
+    @property
     def views(self) -> int:
         """Symmetric views of the board that go into one decision."""
         return 1

@@ -56,8 +56,10 @@ def test_shipped_planner_decides_in_its_graph_as_in_pytorch():
             assert all(np.allclose(x, y, atol=0.05, rtol=1e-4) for x, y in zip(a, b, strict=True))
 
 
-def test_a_search_judges_one_state_by_the_graph_as_in_pytorch(monkeypatch):
+@pytest.mark.parametrize("views", [1, 4])
+def test_a_search_judges_one_state_by_the_graph_as_in_pytorch(views, monkeypatch):
     compiled, plain = mujoban_planner.load(), mujoban_planner.load(compiled=False)
+    compiled.thinking = plain.thinking = views
     monkeypatch.setattr(compiled, "read", lambda state: pytest.fail("it has a graph for one state"))
     for i in range(len(LEVELS.wall)):
         boards = bit_boards(take_levels(LEVELS, np.array([i])))
