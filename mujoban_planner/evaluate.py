@@ -18,13 +18,14 @@ import numpy as np
 from mujoban_core.files import check_file, digest
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.program import read_options, run_command
-from mujoban_core.ranges import check_counts
+from mujoban_core.ranges import check_counts, check_not_negative
 from mujoban_core.reports import keep_report
 from mujoban_core.stats import wilson_interval
 from mujoban_core.threads import set_threads
 from mujoban_planner import SHIPPED, load
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import take_levels
+from mujoban_planner.deliberation import Deliberation
 from mujoban_planner.lookahead import LookAheadPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
@@ -70,10 +71,13 @@ class Options:
     """Where the figures are written."""
 
     def __post_init__(self) -> None:
-        """Reject thinking less than once and fewer than no levels."""
+        """Reject thinking less than once or too long, verdicts that repel, and fewer than no levels."""
         check_counts(self, "episodes", least=0)
         if self.thinking is not None:
             check_counts(self, "thinking")
+        if self.caution is not None:
+            check_not_negative(self, "caution")
+        Deliberation(self.thinking or 0, self.look_ahead)  # refuses what nodes refuse
 
     def level_batch(self) -> LevelBatch:
         """Return the levels.

@@ -278,6 +278,9 @@ def test_evaluate_reports_rate_interval_and_optimality(tmp_path, capsys):
         ("--weights", "missing.safetensors"),
         ("--seed", 10**7),
         ("--thinking", -3),
+        ("--thinking", 65),
+        ("--caution", "nan"),
+        ("--look-ahead", -1),
         ("--episodes", -1),
     ],
 )
