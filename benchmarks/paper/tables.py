@@ -58,10 +58,16 @@ def differences(one: Run, other: Run) -> str:
     shared = sorted(first.keys() & second.keys())
     only = [[seed for seed in shared if a[seed] and not b[seed]] for a, b in ((first, second), (second, first))]
     named = [", ".join(map(str, seeds)) or "none" for seeds in only]
+    weights = [report["weights"] for report in reports if report]
+    why = (
+        "Networks see batches of other sizes there, which changes the last bits of their answers, and with them now and "
+        "then a decision."
+        if weights[0] == weights[1]
+        else "They were played with other weights."
+    )
     return (
         f"Of {len(shared)} levels, solved by `{one.name}` alone: {named[0]}; by `{other.name}` alone: {named[1]} "
-        "(seeds). Networks see batches of other sizes there, which changes the last bits of their answers, and "
-        "with them now and then a decision.\n"
+        f"(seeds). {why}\n"
     )
 
 

@@ -68,6 +68,9 @@ def test_levels_that_end_otherwise_through_the_graph_are_named(folder):
     write(runs.GRAPH, 1, 4, {})
     told = tables.differences(runs.CONFIGURATIONS[0], runs.GRAPH)
     assert "Of 4 levels, solved by `default` alone: 1, 2; by `graph` alone: none (seeds)." in told
+    assert "batches of other sizes" in told
+    write(runs.GRAPH, 1, 4, {"planner": "0" * 16})
+    assert tables.differences(runs.CONFIGURATIONS[0], runs.GRAPH).endswith("They were played with other weights.\n")
 
 
 def test_a_damaged_source_is_named_with_the_command_that_mends_it(folder):
