@@ -27,6 +27,7 @@ from bringup.options import Count, WorldOptions, whole
 from bringup.pipeline import Pipeline, Stage
 from bringup.training_display import run_shown
 from bringup.training_report import EVALUATIONS, write_report
+from bringup.training_seed import seed_of
 from bringup.training_sizes import Machine
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.program import read_options, run_command
@@ -125,7 +126,8 @@ class Options:
     keep: tuple[Literal["controller", "planner", "senses"], ...] = ()
     """Modules that stay what they are there; bags are recorded for the senses alone."""
     physics: Annotated[WorldOptions, tyro.conf.arg(name="")] = field(default_factory=WorldOptions)
-    seed: Annotated[int, whole("N", 0)] = 0
+    seed: Annotated[int | None, whole("N", 0)] = None
+    """Decides levels and weights; by default 0, or one more than that of the run that is gone on from."""
     cores: Count = 2
     device: str = "cpu"
     """Device on which networks learn. A GPU has larger batches, a larger planner, and its time by the clock."""
@@ -136,8 +138,8 @@ class Options:
         """Reject times in which nothing can be learned, and seeds past those for training."""
         if not 0 < self.hours < math.inf:
             raise ValueError(f"--hours {self.hours}: expected a positive number")
-        if not 0 <= self.seed <= LAST_SEED:
-            raise ValueError(f"--seed {self.seed}: expected a whole number from 0 to {LAST_SEED}")
+        if not 0 <= self.stream <= LAST_SEED:
+            raise ValueError(f"--seed {self.stream}: expected a whole number from 0 to {LAST_SEED}")
         if self.keep and self.before is None:
             raise ValueError(f"--keep {' '.join(self.keep)}: expected --continue, which says whose are kept")
         spared = _BAGS if self.has_critic else (*_BAGS, "critic")
@@ -145,6 +147,15 @@ class Options:
         missing = [] if self.before is None else [path for path in needed if not (self.before / path).exists()]
         if missing:
             raise ValueError(f"--continue {self.before}: lacks {missing[0]}, expected the directory of a finished run")
+        if self.before is not None and self.stream == seed_of(self.before):
+            raise ValueError(f"--seed {self.stream}: the levels of {self.before} again, expected another seed")
+
+    @property
+    def stream(self) -> int:
+        """The seed of all stages."""
+        if self.seed is not None:
+            return self.seed
+        return 0 if self.before is None else seed_of(self.before) + 1
 
     @property
     def has_critic(self) -> bool:
@@ -231,7 +242,7 @@ def _kept(options: Options, trained: Sequence[Stage]) -> list[Stage]:
 
 def _controller(options: Options) -> list[Stage]:
     run, teacher, student = options.run, PRODUCTS["teacher"], PRODUCTS["student"]
-    common = ("--seed", str(options.seed), "--task.world", options.physics.world)
+    common = ("--seed", str(options.stream), "--task.world", options.physics.world)
     common += ("--task.body", options.physics.body)
     judged = max(4, min(64, round(_JUDGED_PER_HOUR * options.hours)))
     every = round(min(max(1.0, options.hours), 4.0) * _EVALUATED_STEPS)
@@ -267,7 +278,8 @@ def _planner(options: Options) -> list[Stage]:
     product = WEIGHTS["planner"]
     network = () if options.before is None else options.machine.begun_with(options.before / product)
     every = max(1, round(_seconds(options, "planner") / _PLANNER_EVALUATIONS))
-    command = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.seed), "--evaluate-every", str(every))
+    command = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.stream))
+    command += ("--evaluate-every", str(every))
     begun = _from_before(options, "--init", "planner")
     return [
         _trainer(
@@ -293,7 +305,7 @@ def _senses(options: Options) -> list[Stage]:
         command = ["mujoban_estimator.train", "--bags", *map(str, [*earlier, *bags]), "--out", str(out)]
         command += ["--validation", str(validation.products[0])]
         every = max(1, round(_SENSES_EVALUATIONS * options.hours))
-        command += ["--evaluate-every", str(every), "--seed", str(options.seed), "--steps", str(_STEPS), *_SENSES]
+        command += ["--evaluate-every", str(every), "--seed", str(options.stream), "--steps", str(_STEPS), *_SENSES]
         for part in ("estimator", "termination"):
             command += [f"--learner.{part}.body", options.physics.body]
         if start is not None:
@@ -343,7 +355,7 @@ def _recording(options: Options, name: str) -> Stage:
     modules = tuple(x for role, path in acting.items() for x in (f"--{role}", str(run / path)))
     episodes = max(8, round(_EPISODES_PER_HOUR * options.hours * options.machine.episodes))
     limit = _RECORDED_STEPS * get_body(options.physics.body).time_limit // BALL.time_limit
-    stream = len(_LEVELS) * options.seed + _LEVELS[name]
+    stream = len(_LEVELS) * options.stream + _LEVELS[name]
     seed = TRAIN_SEEDS.start + stream * 10**9
     command = (
         "-m", _RECORDER, "--out", str(run / name), "--episodes", str(episodes),

@@ -39,7 +39,11 @@ class Read(Exception):
     """The options were understood."""
 
 
-@pytest.mark.parametrize("command", sorted({c for page in PAGES for c in commands(page) if not c.startswith("make")}))
+OTHERS = ("make", "python my_")
+"""Starts of commands that are no programs of the repository; what readers save as `my_agent.py` has tests beside."""
+
+
+@pytest.mark.parametrize("command", sorted({c for page in PAGES for c in commands(page) if not c.startswith(OTHERS)}))
 def test_a_documented_command_exists_and_understands_its_options(command, monkeypatch):
     module, arguments = program(shlex.split(command, comments=True))
     assert importlib.util.find_spec(module) is not None

@@ -213,6 +213,21 @@ def test_the_largest_seed_has_levels_for_every_training(tmp_path: Path) -> None:
         Options(seed=seed + 1)
 
 
+def test_a_run_that_goes_on_has_levels_of_its_own(tmp_path: Path) -> None:
+    before = finished(tmp_path / "before")
+    first = commands(Options(run=before))
+    entries = {name: {"command": command, "done": True} for name, command in first.items()}
+    (before / "pipeline.json").write_text(json.dumps(entries))
+    more = commands(Options(run=tmp_path / "more", before=before))
+    for name in ("teacher", "planner", "bags_first", "bags_second", "estimator_first"):
+        old, new = (command[command.index("--seed") + 1] for command in (first[name], more[name]))
+        assert old != new
+    assert more["planner"][more["planner"].index("--seed") + 1] == "1"
+    assert Options(run=tmp_path / "more", before=before, seed=7).stream == 7
+    with pytest.raises(ValueError, match=r"--seed 0: the levels of .*before again, expected another seed"):
+        Options(run=tmp_path / "more", before=before, seed=0)
+
+
 def test_the_senses_are_judged_on_bags_of_which_they_learn_nothing(tmp_path: Path) -> None:
     found = commands(Options(run=tmp_path))
     recorded = found["bags_validation"]
