@@ -253,10 +253,9 @@ class Draw:
     critic: CriticDraw | None = None
     """What is drawn for a critic beside it."""
 
-    @property
-    def overlap(self) -> int:
-        """Ticks that a sequence shares with the one before: windows shorter than it begin at every tick alike."""
-        return self.window - 1 if self.window < self.length else 0
+    def builder(self, window: int) -> SequenceBuilder:
+        """Return what joins ticks to sequences that overlap: windows shorter than these begin at every tick alike."""
+        return SequenceBuilder(self.length, window - 1 if window < self.length else 0)
 
 
 class ReplaySource(Source[Batch]):
@@ -276,7 +275,8 @@ class ReplaySource(Source[Batch]):
         self._player, self._draw, self._generator, self._recorded = player, draw, generator, recorded
         self._replay = SequenceReplay(draw.capacity, draw.length)
         self._long = None if draw.critic is None else SequenceReplay(draw.critic.capacity, draw.length)
-        self._builder = SequenceBuilder(draw.length, draw.overlap)
+        self._builder = draw.builder(draw.window)
+        self._long_builder = None if draw.critic is None else draw.builder(draw.critic.window)
         self._due, self._ticks = 0.0, 0
         self._summary = OutcomeSummary()
 
@@ -310,11 +310,12 @@ class ReplaySource(Source[Batch]):
         if self._recorded is not None:
             beside, _ = self._recorded.tick()
             tick = {name: np.concatenate([values, beside[name]]) for name, values in tick.items()}
-        sequence = self._builder.add(tick)
-        if sequence is not None:
+        if (sequence := self._builder.add(tick)) is not None:
             self._replay.add(sequence)
-            if self._long is not None:
-                self._long.add({name: sequence[name] for name in CRITIC_FIELDS})
+        if self._long is not None and self._long_builder is not None:
+            sequence = self._long_builder.add({name: tick[name] for name in CRITIC_FIELDS})
+            if sequence is not None:
+                self._long.add(sequence)
         self._ticks += 1
         if self._ticks >= self._draw.first:
             self._due += self._draw.per_tick
@@ -330,8 +331,8 @@ class ReplaySource(Source[Batch]):
         parts = {"player": self._player.state(), "replay": self._replay.state(), "builder": self._builder.state()}
         if self._recorded is not None:
             parts["recorded"] = self._recorded.state()
-        if self._long is not None:
-            parts["long"] = self._long.state()
+        if self._long is not None and self._long_builder is not None:
+            parts |= {"long": self._long.state(), "long_builder": self._long_builder.state()}
         return State.of({**parts, "own": own})
 
     def restore(self, state: State) -> None:
@@ -343,6 +344,9 @@ class ReplaySource(Source[Batch]):
         self._builder.restore(state.part("builder"))
         if self._long is not None:
             self._long.restore(state.part("long"))
+        # Checkpoints of earlier versions have none.
+        if self._long_builder is not None and "long_builder" in state.values:
+            self._long_builder.restore(state.part("long_builder"))
         own = state.part("own")
         self._due, self._ticks = own.values["due"], own.values["ticks"]
         self._generator.set_state(own.tensors["generator"])

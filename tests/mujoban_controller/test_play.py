@@ -11,8 +11,18 @@ from mujoban_controller.controller import Recurrent, VisuomotorController
 from mujoban_controller.episodes import SeededEpisodes
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.goal_task import GoalTask
-from mujoban_controller.play import ExploringPlayer, PrivilegedPlayer
+from mujoban_controller.play import (
+    CRITIC,
+    CRITIC_FIELDS,
+    CriticDraw,
+    Draw,
+    ExploringPlayer,
+    Player,
+    PrivilegedPlayer,
+    ReplaySource,
+)
 from mujoban_controller.privileged import PrivilegedPolicy
+from mujoban_rl.engine import State
 from mujoban_sim.oracles import OraclePlanner
 
 
@@ -52,3 +62,40 @@ def test_steady_robots_of_a_stack_that_is_fine_tuned_play_by_the_mean(task):
     with torch.no_grad():
         output = network(*network.to_tensors(inputs), memory=Recurrent(*network.initial_memory(4)))
     assert by_the_mean(torque, output.action.mean[:, 0].numpy()) == [False, True, False, True]
+
+
+class Counter(Player):
+    """Says in every field which tick it is."""
+
+    now = 0
+
+    def tick(self):
+        self.now += 1
+        return {name: np.full((2, 1), self.now, np.float32) for name in CRITIC_FIELDS}, []
+
+    def take(self, weights):
+        """Play on."""
+
+    def state(self):
+        return State({"now": self.now})
+
+    def restore(self, state):
+        self.now = state.values["now"]
+
+    def close(self):
+        """Hold nothing."""
+
+
+def test_critics_windows_begin_at_every_tick_that_was_played():
+    critic = CriticDraw(capacity=64, window=6, updates=2, windows=4)
+    draw = Draw(capacity=64, length=16, window=16, windows=1, per_tick=1.0, first=48, critic=critic)
+    source = ReplaySource(Counter(), draw, torch.Generator().manual_seed(0))
+    begun = set()
+    for batch in range(200):
+        if batch == 20:  # goes on from a checkpoint
+            state, source = source.state(), ReplaySource(Counter(), draw, torch.Generator())
+            source.restore(state)
+        windows = source.next_batch()[CRITIC + "reward"]
+        assert windows.shape == (2, 4, 6, 1)
+        begun |= set(windows[..., 0, 0].flatten().long().tolist())
+    assert len(begun & set(range(1, 150))) > 140, "but for those that were not drawn, all"
