@@ -65,6 +65,11 @@ class Disturbance:
     spin_again: float = 0.002
     """Chance per tick of another turn."""
 
+    @classmethod
+    def late_ends(cls) -> Disturbance:
+        """Return what has every instruction end late and changes nothing else."""
+        return cls(wander=0.0, stray=0.0, delay=1.0, early=0.0, shaky=0.0, spin=0.0, spin_again=0.0)
+
     def __post_init__(self) -> None:
         """Reject probabilities out of [0, 1]."""
         for name in ("wander", "stray", "infeasible", "delay", "early", "shaky", "max_noise", "spin", "spin_again"):

@@ -51,7 +51,9 @@ _MAP_TERMS: Final = (
 )
 _END_TERMS: Final = (
     "Precision is the share of the instructions that it ended which were completed by then; *early by over 2 ticks* "
-    "the share that it ended more than 2 ticks before, or that never were."
+    "the share that it ended more than 2 ticks before, or that never were. *On time* is the share of those "
+    "completed, and of those ended that never were, whose end it told within 2 ticks of it; recall is of those that it "
+    "did not end early."
 )
 _GRID_LIMITS: Final = "levels of up to 10 x 10 cells that look like the generator's; warehouses drawn by this renderer"
 

@@ -129,8 +129,23 @@ class Options:
     shared: Annotated[ClusterOptions, arg(name="")] = field(default_factory=ClusterOptions)
     undisturbed: bool = False
     """Let the policy do as it will."""
+    late_ends: bool = False
+    """Have it end every instruction some ticks late, and else do as it will: when ends are told is judged by what
+    follows them."""
     physics: Annotated[WorldOptions, arg(name="")] = field(default_factory=WorldOptions)
     modules: Annotated[ModuleOptions, arg(name="")] = field(default_factory=ModuleOptions)
+
+    def __post_init__(self) -> None:
+        """Reject what contradicts itself."""
+        if self.undisturbed and self.late_ends:
+            raise ValueError("--undisturbed --late-ends: expected one of them, both leave all else undisturbed")
+
+    @property
+    def disturbance(self) -> Disturbance | None:
+        """How episodes depart from the policy."""
+        if self.undisturbed:
+            return None
+        return Disturbance.late_ends() if self.late_ends else Disturbance()
 
     @property
     def parts(self) -> int:
@@ -332,7 +347,7 @@ def _job(options: Options, seed: int, part: int) -> Job:
         prefix=f"part{part}_",
         episodes=episodes,
         stack=options.modules.stack(options.physics.body),
-        disturbance=None if options.undisturbed else Disturbance(),
+        disturbance=options.disturbance,
         batch=options.batch,
         time_limit=options.time_limit or None,
         run_seed=int(np.random.SeedSequence([options.run_seed, part]).generate_state(1)[0]),

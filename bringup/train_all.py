@@ -330,7 +330,10 @@ def _earlier_bags(options: Options, name: str) -> list[Path]:
 
 
 def _validation(options: Options) -> Stage:
-    """Return a stage that records the bags on which the senses are judged, as the first round but undisturbed."""
+    """Return a stage that records the bags on which the senses are judged, as the stack will play.
+
+    It looks around, and ends instructions late: of recordings that end with them nobody is told late.
+    """
     name = "bags_validation"
     first, run = _recording(options, "bags_first"), options.run
     episodes = max(4, min(32, round(_VALIDATION_PER_HOUR * options.hours)))
@@ -338,7 +341,8 @@ def _validation(options: Options) -> Stage:
     command = list(first.command)
     for option, value in replaced.items():
         command[command.index(option) + 1] = value
-    command += ["--allow-test-seeds", "--undisturbed"]
+    look = str(get_body(options.physics.body).look_ticks)
+    command += ["--allow-test-seeds", "--late-ends", "--look-around", look]
     return replace(
         first, name=name, command=tuple(command), products=(run / name,), seconds=_seconds(options, name)
     )  # fmt: skip

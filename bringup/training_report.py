@@ -24,7 +24,8 @@ from mujoban_sokoban.generator import FRESH_SEEDS
 
 _PREFIX = "evaluation/"
 _RATES: Final = (
-    "success_rate", "agent_accuracy", "boxes_all_right_if_seen", "termination_precision", "termination_recall",
+    "success_rate", "agent_accuracy", "boxes_all_right_if_seen", "termination_on_time", "termination_precision",
+    "termination_recall",
 )  # fmt: skip
 """Scores that are drawn, of all that start so; the table has steps as well."""
 _ACTING: Final = ("teacher", "controller_")

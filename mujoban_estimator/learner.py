@@ -39,7 +39,7 @@ _PLACE_OFF: Final = 0.02
 """Standard deviation of what needles of the place are off in use, in cells."""
 _HEADING_OFF: Final = math.radians(2.0)
 """The same of those of the heading."""
-JUDGED_BY: Final = ("boxes_all_right_if_seen", "termination_precision")
+JUDGED_BY: Final = ("boxes_all_right_if_seen", "termination_on_time")
 """Rates that tell which modules of a run are best, in this order: wrong estimates are what loses levels."""
 
 

@@ -16,6 +16,8 @@ from mujoban_estimator.estimator import BINARY
 _BINS: Final = 10
 SLACK: Final = 3
 """Ticks that a recording must go on after an instruction's completion for its detection to count."""
+_ON_TIME: Final = 2
+"""Ticks between completion and detection that make no difference to what follows."""
 _INNER: Final = (slice(None), slice(1, -1), slice(1, -1))
 """Cells that are not the outer wall, which needs no estimate."""
 
@@ -90,11 +92,17 @@ class TerminationScores:
         self._delays: list[int] = []
         self._hits = 0
         self._missed = 0
+        self._on_time: list[bool] = []
+        """Of instructions that were completed, and recorded for long enough to tell, or ended without having been."""
 
     def add(self, probability: NDArray[np.float32], completed: NDArray[np.bool_], threshold: float) -> None:
         """Count the ticks of one instruction, [T], until it was ended in the recording."""
         detection = _first(probability > threshold)
         onset = _first(completed)
+        if onset is None:
+            self._on_time += [False] * (detection is not None)
+        elif len(completed) - onset > _ON_TIME or (detection is not None and detection < onset):
+            self._on_time.append(detection is not None and abs(detection - onset) <= _ON_TIME)
         if detection is not None and (onset is None or detection < onset):
             self._early.append((onset if onset is not None else 1_000) - detection)
         elif detection is not None:
@@ -107,9 +115,10 @@ class TerminationScores:
             self._delays.append(detection - onset)
 
     def report(self) -> dict[str, float]:
-        """Return precision, recall and delay."""
+        """Return precision, recall and delay, and the share that was told on time, which is all of them in one."""
         early = np.array(self._early)
         return {
+            "termination_on_time": _share(sum(self._on_time), len(self._on_time)),
             "termination_precision": _share(self._hits, self._hits + len(early)),
             "termination_early_by_over_2_ticks": _share(int((early > 2).sum()), self._hits + len(early)),
             "termination_recall": _share(len(self._delays), len(self._delays) + self._missed),

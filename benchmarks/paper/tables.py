@@ -60,8 +60,8 @@ def differences(one: Run, other: Run) -> str:
     named = [", ".join(map(str, seeds)) or "none" for seeds in only]
     weights = [report["weights"] for report in reports if report]
     why = (
-        "Networks see batches of other sizes there, which changes the last bits of their answers, and with them now and "
-        "then a decision."
+        "Networks see batches of other sizes there, which changes the last bits of their answers, and with them now "
+        "and then a decision."
         if weights[0] == weights[1]
         else "They were played with other weights."
     )

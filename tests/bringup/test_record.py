@@ -12,6 +12,8 @@ from bringup.record import Job, MixedEpisodes, Options, _job, record
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import ROLES
 from mujoban_core.signals import Interrupted, interruptible
+from mujoban_estimator.bag_stream import TOPICS, stretches
+from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
 from mujoban_sim.world import World
 from mujoban_sokoban.generator import TRAIN_SEEDS
 
@@ -109,3 +111,16 @@ def test_what_a_recording_draws_does_not_follow_from_a_level():
         # The random numbers of which levels are generated.
         streams = [np.random.default_rng([difficulty, seed]) for seed in range(7, 57)]
         assert drawn != [list(DIFFICULTIES)[int(rng.integers(len(DIFFICULTIES)))] for rng in streams]
+
+
+@pytest.mark.parametrize(("late", "after"), [(False, {1}), (True, set(range(2, 10)))])
+def test_recordings_with_late_ends_go_on_after_an_instruction_is_completed(late, after, tmp_path):
+    options = Options(tmp_path, undisturbed=not late, late_ends=late)
+    stack = Stack({role: Choice(role, "oracle") for role in ROLES})
+    record(Job(tmp_path, "", MixedEpisodes(1, TRAIN_SEEDS.start, [3]), stack, options.disturbance, 1, 400, 0))
+    (bag,) = find_bags([tmp_path])
+    (ticks,) = stretches(open_training_bag(bag, TOPICS), 1000, ReadReport())
+    instructions = np.split(ticks.completed, np.flatnonzero(ticks.terminated))[1:-1]
+    assert len(instructions) > 3 and {int(completed.sum()) for completed in instructions} <= after
+    with pytest.raises(ValueError, match="expected one of them"):
+        Options(tmp_path, undisturbed=True, late_ends=True)

@@ -41,3 +41,28 @@ def test_termination_scores_count_instructions(detection, precision, recall, del
     for name, value in (("precision", precision), ("recall", recall), ("mean_delay", delay)):
         found = report[f"termination_{name}"]
         assert found == value or (value is None and np.isnan(found))
+
+
+@pytest.mark.parametrize(
+    ("detection", "onset", "ticks", "on_time"),
+    [
+        (5, 4, 10, 1.0),
+        (2, 4, 10, 1.0),
+        (1, 4, 10, 0.0),
+        (7, 4, 10, 0.0),
+        (None, 4, 10, 0.0),
+        (3, None, 10, 0.0),
+        (None, None, 10, None),
+        (None, 4, 6, None),
+    ],
+)
+def test_an_end_is_on_time_within_two_ticks_of_completion_where_that_can_be_told(detection, onset, ticks, on_time):
+    probability, completed = np.zeros(ticks, np.float32), np.zeros(ticks, bool)
+    if onset is not None:
+        completed[onset:] = True
+    if detection is not None:
+        probability[detection] = 0.9
+    scores = TerminationScores()
+    scores.add(probability, completed, 0.5)
+    found = scores.report()["termination_on_time"]
+    assert found == on_time or (on_time is None and np.isnan(found))
