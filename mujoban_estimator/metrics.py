@@ -101,7 +101,7 @@ class TerminationScores:
         onset = _first(completed)
         if onset is None:
             self._on_time += [False] * (detection is not None)
-        elif len(completed) - onset > _ON_TIME or (detection is not None and detection < onset):
+        elif len(completed) - onset > _ON_TIME:
             self._on_time.append(detection is not None and abs(detection - onset) <= _ON_TIME)
         if detection is not None and (onset is None or detection < onset):
             self._early.append((onset if onset is not None else 1_000) - detection)

@@ -54,6 +54,7 @@ def test_termination_scores_count_instructions(detection, precision, recall, del
         (3, None, 10, 0.0),
         (None, None, 10, None),
         (None, 4, 6, None),
+        (1, 4, 6, None),
     ],
 )
 def test_an_end_is_on_time_within_two_ticks_of_completion_where_that_can_be_told(detection, onset, ticks, on_time):
