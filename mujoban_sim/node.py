@@ -27,8 +27,8 @@ from mujoban_msgs_py.runtime.pace import Pace
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.topics import TICK, Topic
+from mujoban_sim.node_parameters import PARAMETERS
 from mujoban_sim.observation import ObservationPublisher
-from mujoban_sim.parameters import PARAMETERS
 from mujoban_sim.resume import Moment, Place
 from mujoban_sim.tick_messages import TickLabel
 from mujoban_sim.world import World

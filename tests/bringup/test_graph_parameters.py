@@ -18,7 +18,7 @@ from mujoban_estimator.estimator import StateEstimator
 from mujoban_planner.deliberation import Deliberation
 from mujoban_rl.weights import save_weights
 from mujoban_sim.node import SimulatorNode
-from mujoban_sim.parameters import PARAMETERS
+from mujoban_sim.node_parameters import PARAMETERS
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import PLAY_SEEDS
 
