@@ -10,7 +10,7 @@ Shapes: B robots, K boxes, J joints, U actuators, D features.
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,7 +148,7 @@ def privileged_features(
         np.where(push, world.box_speed[rows, goals.box_index][:, None] / size, 0.0),
         np.eye(len(GoalKind) - 1)[np.minimum(goals.kind, GoalKind.HOLD)],
         elapsed[:, None],
-        _surroundings(world, lane),
+        _surroundings(world),
     ]
     return np.concatenate(parts, 1).astype(np.float32)
 
@@ -160,12 +160,24 @@ def _posture(body: Body, felt: NDArray[np.float32]) -> NDArray[np.float64]:
     return (2.0 * felt[:, body.proprio.joint_position][:, kept] - low - high) / (high - low)
 
 
-def _surroundings(world: GoalView, along: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return whether a wall, and whether a box, is in each of the cells around the origin cell, [B, 22]."""
-    rows = np.arange(world.batch)[:, None]
+NEIGHBOURS: Final = len(_NEIGHBOURS)
+"""Cells of `neighbour_cells`."""
+
+
+def neighbour_cells(world: GoalView) -> NDArray[np.int64]:
+    """Return the cells around the origin cell, in the instruction's order, (row, column), [B, NEIGHBOURS, 2].
+
+    Those beyond the board are the nearest on it.
+    """
+    along = INSTRUCTION_AXES[world.goals.direction]
     origin, left = cell_to_xy(world.goals.origin_cell), np.stack([-along[:, 1], along[:, 0]], 1)
     around = origin[:, None] + _NEIGHBOURS[:, :1] * along[:, None] + _NEIGHBOURS[:, 1:] * left[:, None]
-    cells = np.clip(xy_to_cell(around), 0, GRID_SIZE - 1)
+    return np.clip(xy_to_cell(around), 0, GRID_SIZE - 1)
+
+
+def _surroundings(world: GoalView) -> NDArray[np.float64]:
+    """Return whether a wall, and whether a box, is in each of the cells around the origin cell, [B, 22]."""
+    rows, cells = np.arange(world.batch)[:, None], neighbour_cells(world)
     wall = world.wall[rows, cells[..., 0], cells[..., 1]]
     box = (cells[:, :, None] == world.box_cell[:, None]).all(-1).any(-1)
     return np.concatenate([wall, box], 1).astype(np.float64)

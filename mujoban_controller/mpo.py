@@ -220,7 +220,7 @@ class MPOLearner(ProductLearner[Batch]):
         if beside:
             stats, accepted = self._update_critic(beside, guard)
         else:
-            loss = self._critic_loss(batch, self._value_of_play(batch) if draws is None else draws.q.mean(0))
+            loss = self._critic_loss(batch, self._value_of_play(batch) if draws is None else self._value(batch, draws))
             stats = {"loss/critic": float(loss.detach())}
             accepted = self._step_critic(loss, guard)
         if accepted and draws is not None:
@@ -271,6 +271,13 @@ class MPOLearner(ProductLearner[Batch]):
         action = target.mean + target.scale * paired_noise(config.samples, target.mean, self._generator)
         q = self.target_critic(batch["features"][:, config.n_step :], action)
         return _Draws(target, action, q)
+
+    def _value(self, batch: Batch, draws: _Draws) -> Tensor:
+        """Return the values of the policy in the last W - n ticks, [M, W - n]; where another drove, of what he did."""
+        value = draws.q.mean(0)
+        if "driven" not in batch:
+            return value
+        return torch.where(batch["driven"][:, self.config.n_step :], value, self._value_of_play(batch))
 
     @torch.no_grad()
     def _value_of_play(self, batch: Batch) -> Tensor:

@@ -19,9 +19,9 @@ from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.joint.stack import DrawingController, DrawingPlanner
 from mujoban_baselines.task import MujobanTask, TaskConfig
 from mujoban_controller.controller import MEMORY_FIELDS, VisuomotorController
-from mujoban_controller.goal_features import privileged_features
+from mujoban_controller.goal_features import NEIGHBOURS, neighbour_cells, privileged_features
 from mujoban_core.bodies import get_body
-from mujoban_core.grid import CHANNELS, GRID_SIZE, INSTRUCTION_LIMIT
+from mujoban_core.grid import CHANNELS, GRID_SIZE, INSTRUCTION_AXES, INSTRUCTION_LIMIT, TARGET
 from mujoban_core.interfaces import Observation, renew_rows
 from mujoban_core.look_around import LookAroundController, look_around
 from mujoban_core.sense_plan_act import Decision, PolicyState, SensePlanAct
@@ -31,11 +31,28 @@ from mujoban_planner.planner import LearnedPlanner
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
 from mujoban_rl.replay import SequenceBuilder
+from mujoban_sim.world import World
 
-MAP: Final = GRID_SIZE * GRID_SIZE * len(CHANNELS)
-"""Features of the critic that tell the true map, behind those of the goal: what earns a reward."""
+SEEN: Final = GRID_SIZE * GRID_SIZE * len(CHANNELS) + NEIGHBOURS
+"""Features of the critic that tell what earns a reward, behind those of the goal: `around_instruction`."""
 DECISION: Final = "decision/"
 """Begins the names of what is delivered of decisions."""
+
+
+def around_instruction(world: World) -> NDArray[np.float32]:
+    """Return the true map, turned so that the instruction points along its rows, and which neighbours are targets.
+
+    The critic sees all else from the instruction, too: in a map that stands still nothing says which way is ahead.
+    Of shape [B, SEEN].
+    """
+    state, direction = world.abstract_state(), world.goals.direction
+    turned = state.copy()
+    for rotated, (x, y) in zip(np.unique(direction), INSTRUCTION_AXES[np.unique(direction)], strict=True):
+        rows = direction == rotated
+        turned[rows] = np.rot90(state[rows], -round(np.arctan2(y, x) / (np.pi / 2)), (1, 2))
+    cells = neighbour_cells(world)
+    targets = state[np.arange(world.batch)[:, None], cells[..., 0], cells[..., 1], TARGET]
+    return np.concatenate([turned.reshape(world.batch, -1), targets], 1, dtype=np.float32)
 
 
 class Networks(NamedTuple):
@@ -165,7 +182,7 @@ class JointActor(Actor):
         # The tick in which an instruction is given counts as its first.
         elapsed = (state.termination.elapsed - 1) / INSTRUCTION_LIMIT
         goal = privileged_features(world, elapsed, self._torque)
-        return np.concatenate([goal, world.abstract_state().reshape(world.batch, MAP)], 1, dtype=np.float32)
+        return np.concatenate([goal, around_instruction(world)], 1, dtype=np.float32)
 
     def state(self) -> State:
         """Return all that changes but the weights."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 import mujoban_planner
-from mujoban_baselines.joint.actor import DECISION, MAP, Networks, make_actor
+from mujoban_baselines.joint.actor import DECISION, SEEN, Networks, make_actor
 from mujoban_baselines.joint.decisions import FIELDS
 from mujoban_baselines.joint.settings import JointSettings, StartingWeights
 from mujoban_baselines.task import TaskConfig
@@ -31,6 +31,8 @@ from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import load_weights, save_weights
 
 _CRITIC_WIDTH = 256
+_LEARNER = 0x6C6561
+"""Sets the learner's random streams apart from those of actors."""
 
 
 class JointBatch(NamedTuple):
@@ -85,7 +87,7 @@ class JointLearner(Learner[JointBatch]):
         """Train `networks` in place; `generator` draws the torques of the E-step."""
         self.networks, body = networks, networks.controller.body
         networks.controller.mixed_precision = True
-        critic = Critic(body, _CRITIC_WIDTH, extra=MAP)
+        critic = Critic(body, _CRITIC_WIDTH, extra=SEEN)
         self.controller = MPOLearner(
             networks.controller.train(), body, settings.controller, generator, critic=critic
         )
@@ -149,7 +151,8 @@ def joint_parts(
         load_weights(VisuomotorController, start.path("controller", task.body), body=task.body),
         mujoban_planner.load(start.path("planner", task.body), compiled=False),
     )
-    streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(2)]
+    # Not of [seed] alone, which is what NumPy makes of [seed, 0], the first actor's.
+    streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence([_LEARNER, seed]).spawn(2)]
     generators = [torch.Generator().manual_seed(stream) for stream in streams]
     factory = partial(make_actor, task, networks.plans(), start, settings, seed)
     own = settings.controller

@@ -11,6 +11,8 @@ from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_planner.discrete_mpo import MPOSettings
+from mujoban_rl.losses.mpo_continuous import MPOConfig
+from mujoban_rl.losses.mpo_discrete import DiscreteMPOConfig
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,9 @@ class PlannerSettings:
     @property
     def mpo(self) -> MPOSettings:
         """What the planner's learner reads of it."""
-        return MPOSettings(learning_rate=self.rate)
+        # From where others begin, temperature and multiplier take thousands of updates to come down.
+        duals = DiscreteMPOConfig(initial_temperature=0.3, initial_alpha=1.0)
+        return MPOSettings(learning_rate=self.rate, mpo=duals)
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class JointSettings:
     controller: MPOTrainingConfig = field(
         default_factory=lambda: MPOTrainingConfig(
             window=16, windows=16, sequence=16, replay=24_000, first=8_000, reuse=1.0, gamma=0.99, critic_first=400,
-            explore=0.1, policy_rate=3e-5,
+            explore=0.1, policy_rate=3e-5, loss=MPOConfig(initial_temperature=0.2),
         )
     )
     """MPO over torques, with a critic that sees the truth."""

@@ -9,20 +9,24 @@ import torch
 
 import mujoban_controller
 import mujoban_planner
-from mujoban_baselines.joint.actor import Networks, make_actor
+from mujoban_baselines.joint.actor import Networks, around_instruction, make_actor
 from mujoban_baselines.joint.decisions import DecisionLog
 from mujoban_baselines.joint.learner import JointBatch, joint_parts
 from mujoban_baselines.joint.settings import JointSettings, PlannerSettings, StartingWeights
 from mujoban_baselines.task import TaskConfig
 from mujoban_baselines.train import JointRunConfig, main, make_trainer
+from mujoban_controller.goal_features import NEIGHBOURS
 from mujoban_controller.mpo import MPOTrainingConfig
 from mujoban_core.bodies import ANT, BALL
 from mujoban_core.files import digest
-from mujoban_core.grid import Instruction
+from mujoban_core.grid import AGENT, BOX, TARGET, Instruction
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.testing import check_refusal, check_resuming
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.levels import Level
 
 TASK = TaskConfig(levels="easy", robots=2, episode_seconds=2.4)
 CONTROLLER = MPOTrainingConfig(
@@ -76,6 +80,22 @@ def test_returns_go_over_instructions_however_long_each_took():
     assert [instruction for instruction, *_ in finished(log)] == [0], "what time cut short is forgotten"
 
 
+def test_the_critic_sees_which_way_a_push_goes():
+    """North of the robot a box before a target, south of it a box before none: only one of the pushes earns."""
+    level = Level.from_text("#####\n# . #\n# $ #\n# @ #\n# $ #\n#   #\n#.  #\n#####\n")
+    seen = []
+    for direction in (Instruction.NORTH, Instruction.SOUTH):
+        world = World(1, max_boxes=2)
+        world.reset([0], [EpisodeSpec(level, 0)])
+        world.instruct(np.array([direction]), np.array([True]))
+        seen.append(around_instruction(world)[0])
+        state = seen[-1][:-NEIGHBOURS].reshape(10, 10, 4)
+        ((row, column),) = np.argwhere(state[..., AGENT] > 0.5)
+        assert state[row, column + 1, BOX] == state[row, column - 1, BOX] == 1.0, "ahead is to the right"
+        assert (state[row, column + 2, TARGET] == 1.0) == (direction == Instruction.NORTH)
+    assert [int(one[-NEIGHBOURS:].sum()) for one in seen] == [1, 0]
+
+
 def learner_and_source(settings=SMALL, task=TASK):
     return joint_parts(task, StartingWeights(), settings, 0, ActorOptions())
 
@@ -119,6 +139,19 @@ def test_policies_are_held_while_their_critics_learn_and_move_after_that():
     batch.ticks["driven"][:] = False
     learner.update(batch, 0.0, NaNGuard())
     assert not moved("controller") and moved("planner"), "of a turn on the spot the controller learns nothing"
+    source.close()
+
+
+def test_while_the_robot_turns_to_look_the_critic_expects_the_turn_and_not_what_the_policy_would_do():
+    learner, source = learner_and_source()
+    source.publish(learner.weights(), 0)
+    ticks, own = source.next_batch().ticks, learner.controller
+    draws = own._draw(ticks)
+    driven = torch.zeros_like(ticks["driven"])
+    driven[0] = True
+    value = own._value({**ticks, "driven": driven}, draws)
+    torch.testing.assert_close(value[0], draws.q.mean(0)[0], atol=0.0, rtol=0.0)
+    torch.testing.assert_close(value[1:], own._value_of_play(ticks)[1:], atol=0.0, rtol=0.0)
     source.close()
 
 
