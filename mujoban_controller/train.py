@@ -152,12 +152,14 @@ class Options:
 class _Parts:
     """Makes learner and source of a stage; every random stream has a seed of its own."""
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: Options, began: int) -> None:
+        """Make them; `began` sets the streams of a run that was copied lightly apart from those it had before."""
         self.options, self.config = options, options.config
         config = self.config
         self.device = usable_device(options.device)
         torch.manual_seed(config.seed)
-        self._streams = iter(np.random.SeedSequence(config.seed).spawn(8))
+        # With nothing before, the streams of the seed alone: NumPy takes a missing number for 0.
+        self._streams = iter(np.random.SeedSequence([config.seed, began]).spawn(8))
         rng = np.random.default_rng(next(self._streams))
         episodes = TrainingEpisodes(config.task.difficulty, rng, max_nodes=PLANNER_NODES)
         self.task = GoalTask(
@@ -299,7 +301,7 @@ def make_trainer(options: Options) -> Trainer[Any]:
     origins = {name: origin(getattr(config, name)) for name in ("teacher", "initial", "critic")}
     beside = {"bag_share": options.bag_share if options.bags else None, "origins": origins}
     directory = RunDirectory(options.run, config, beside=beside)
-    learner, source = _Parts(options).make()
+    learner, source = _Parts(options, directory.began).make()
     record = {
         **provenance(),
         "training": directory.options,

@@ -69,12 +69,14 @@ def judge_turning(
     )  # fmt: skip
     summary, turned = OutcomeSummary(), np.zeros(episodes)
     pose = task.world.pose.copy()
-    start = pose[:, :2]
+    start = pose[:, :2].copy()
     report: dict[str, dict[str, float]] = {}
     for tick in range(1, TICKS[-1] + 1):
         summary.add(task.step(driver(task)).outcomes)
         before, pose = pose, task.world.pose.copy()
-        turned += wrap_angles(pose[:, 2] - before[:, 2])
+        # Where a robot has fallen another episode begins, with a heading and a place of its own.
+        turned += np.where(task.first, 0.0, wrap_angles(pose[:, 2] - before[:, 2]))
+        start[task.first] = pose[task.first, :2]
         if tick in TICKS:
             degrees = np.degrees(np.abs(turned))
             off = np.linalg.norm(pose[:, :2] - start, axis=1) / task.world.body.cell_size

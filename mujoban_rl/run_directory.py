@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -171,6 +171,17 @@ class RunDirectory:
                 optimiser.load_state_dict(state)
                 _lay_out(optimiser)
             return Snapshot(content["step"], content["extra"], _below(flat, "tensor/"), light)
+
+    @property
+    def began(self) -> int:
+        """Samples that a run had when it was copied lightly: what comes then is drawn apart. 0 if it was not."""
+        if not (checkpoints := self._checkpoints()):
+            return 0
+        with suppress(ValueError, KeyError, TypeError):  # what is damaged is named where it is loaded
+            content = json.loads(checkpoints[0].with_suffix(".json").read_text())
+            extra = content["extra"]
+            return int(extra["progress"]["samples"] if content.get("light") else extra.get("began", 0))
+        return 0
 
     @contextmanager
     def reading(self, step: int | None) -> Iterator[None]:

@@ -19,14 +19,14 @@ from mujoban_controller.goal_rewards import RewardConfig
 from mujoban_controller.goal_settings import GoalTaskConfig
 from mujoban_controller.instructions import InstructionConfig, TerminationConfig
 from mujoban_controller.mpo import AsymmetricConfig, MPOTrainingConfig
-from mujoban_controller.ppo import PPOTrainingConfig
+from mujoban_controller.ppo import PPOTrainingConfig, RolloutSource
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, main, make_trainer
 from mujoban_core.bodies import BALL
 from mujoban_core.grid import Instruction
-from mujoban_rl.engine import Trainer
+from mujoban_rl.engine import CARRIED, Trainer
 from mujoban_rl.limits import NaNGuard
-from mujoban_rl.run_directory import RunDirectory, RunError
+from mujoban_rl.run_directory import RunDirectory, RunError, copy_light
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import WeightsError, load_weights, read_record, save_weights
 from mujoban_sim.goals import GoalKind
@@ -104,6 +104,21 @@ def test_a_batch_with_nan_leaves_all_that_a_stage_learns_untouched(make, tmp_pat
 
 def test_a_run_that_is_terminated_and_resumed_equals_one_that_never_stopped(make, tmp_path):
     check_resuming(make, tmp_path, stop_at=3, updates=6)
+
+
+def test_a_run_that_is_carried_elsewhere_plays_levels_of_its_own(make, tmp_path):
+    def levels(trainer):
+        task = trainer.source.task if isinstance(trainer.source, RolloutSource) else trainer.source.player.task
+        return {spec.seed for spec in task.world.episodes}
+
+    first = make(tmp_path / "here")
+    begun = levels(first)
+    first.run(limit_updates=2)
+    copy_light(tmp_path / "here", tmp_path / "there", CARRIED)
+    carried = make(tmp_path / "there")
+    assert begun and not levels(carried) & begun
+    carried.run(limit_updates=4)
+    assert RunDirectory(tmp_path / "there", carried.directory.config).began == first.progress.samples > 0
 
 
 def test_a_device_that_is_not_there_is_named_before_anything_is_made(tmp_path):
