@@ -106,6 +106,8 @@ class AsymmetricConfig(MPOTrainingConfig):
     initial_scale: float = 0.0
     """Standard deviation of the torques at the start; 0: the policy's own. That of a distilled one is a tenth: within
     it values hardly differ, and the critic's errors do."""
+    loss: MPOConfig = field(default_factory=lambda: MPOConfig(initial_temperature=0.3))
+    """From Acme's 10 the temperature takes a third of such a run to come down to where values count."""
 
     def __post_init__(self) -> None:
         """Reject numbers with which the critic learns nothing as well."""
