@@ -81,6 +81,10 @@ class EveryNth(LazyEpisodes):
         self._episodes, self._first, self._n = episodes, first, n
         self.max_boxes = episodes.max_boxes
 
+    def number(self, index: int) -> int:
+        """Return the number of an episode among all of the run."""
+        return self._episodes.number(self._first + index * self._n)
+
     def _make(self, index: int) -> EpisodeSpec:
         return self._episodes[self._first + index * self._n]
 

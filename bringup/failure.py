@@ -131,8 +131,8 @@ def explain(decisions: list[DecisionRecord], last: NDArray[np.bool_]) -> Failure
     """
     if not decisions:
         return Failure.LEVEL_LOST if is_unsolvable(last) else Failure.TIME_LIMIT
-    if is_unsolvable(decisions[-1].truth) and not is_unsolvable(decisions[0].truth):
-        return _explain_loss(decisions)
+    if is_unsolvable(last) and not is_unsolvable(decisions[0].truth):
+        return _explain_loss(decisions, last)
     tail = decisions[-TAIL:]
     # What was possible and not carried out, nobody's estimate is to blame for.
     vain = (after.timed_out and _is_possible(before) for before, after in pairwise(tail))
@@ -161,11 +161,12 @@ def _is_possible(decision: DecisionRecord) -> bool:
     return bool((abstract_successor(decision.truth, decision.instruction)[..., AGENT] != agent).any())
 
 
-def _explain_loss(decisions: list[DecisionRecord]) -> Failure:
-    solvable, lost = 0, len(decisions) - 1
+def _explain_loss(decisions: list[DecisionRecord], last: NDArray[np.bool_]) -> Failure:
+    states = [*(decision.truth for decision in decisions), last]
+    solvable, lost = 0, len(decisions)
     while lost - solvable > 1:
         middle = (solvable + lost) // 2
-        if is_unsolvable(decisions[middle].truth):
+        if is_unsolvable(states[middle]):
             lost = middle
         else:
             solvable = middle
@@ -174,4 +175,5 @@ def _explain_loss(decisions: list[DecisionRecord]) -> Failure:
         return Failure.WRONG_ESTIMATE
     if is_unsolvable(abstract_successor(fatal.truth, fatal.instruction)):
         return Failure.PLANNER_DEAD_END
-    return Failure.CONTROLLER_TIME_OUT if decisions[lost].timed_out else Failure.MISEXECUTION
+    timed_out = lost < len(decisions) and decisions[lost].timed_out
+    return Failure.CONTROLLER_TIME_OUT if timed_out else Failure.MISEXECUTION

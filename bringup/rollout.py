@@ -19,7 +19,7 @@ from mujoban_core.interfaces import GroundTruth, Observation, module_seeds, rene
 from mujoban_core.sense_plan_act import Decision
 from mujoban_core.trees import map_leaves
 from mujoban_sim.world import World
-from mujoban_sokoban.episodes import EpisodeSpec
+from mujoban_sokoban.episodes import EpisodeSpec, LazyEpisodes
 
 if TYPE_CHECKING:
     from mujoban_sim.rendering import CameraName
@@ -107,7 +107,7 @@ def ticks(
     rows = np.arange(min(world.batch, len(episodes)))
     episode = rows.copy()
     step = np.zeros(len(rows), np.int64)
-    seeds = module_seeds(run_seed, episode + 1)
+    seeds = module_seeds(run_seed, _numbers(episodes, episode))
     state = policy.initial_state(seeds)
     asked, camera = camera is None, FIRST_PERSON_CAMERA in policy.cameras if camera is None else camera
     above = TOP_DOWN_CAMERA in policy.cameras
@@ -141,7 +141,7 @@ def ticks(
         renewed = ended & ~finished
         if renewed.any():
             world.reset(rows[renewed], [episodes[i] for i in episode[renewed].tolist()])
-            seeds[renewed] = module_seeds(run_seed, episode[renewed] + 1)
+            seeds[renewed] = module_seeds(run_seed, _numbers(episodes, episode[renewed]))
             state = renew_rows(state, policy.initial_state(seeds), renewed)
             step[renewed] = 0
         kept = np.flatnonzero(~finished)
@@ -149,6 +149,13 @@ def ticks(
             return
         if kept.size < len(rows):
             rows, episode, step, seeds, state = select((rows, episode, step, seeds, state), kept)
+
+
+def _numbers(episodes: Sequence[EpisodeSpec], index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the numbers, from 1 on, of episodes within the run that they may be a share of, [B]."""
+    if isinstance(episodes, LazyEpisodes):
+        return np.array([episodes.number(i) for i in index.tolist()], np.int64)
+    return index + 1
 
 
 def _ending(world: World, rows: NDArray[np.int64], *, camera: bool, above: bool) -> Ending:

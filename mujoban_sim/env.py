@@ -139,7 +139,7 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     | ``proprio`` | float32 (P,) | proprioception, see `mujoban_core.bodies.ProprioSlices`; P = 16 (ant: 28) | all |
     | ``pose`` | float32 (3,) | x, y, yaw of the robot | all |
     | ``velocity`` | float32 (3,) | vx, vy, yaw rate in the frame ``map`` | state, privileged |
-    | ``box_position`` | float32 (K, 2) | box centres; absent boxes lie 100 m away | state, privileged |
+    | ``box_position`` | float32 (K, 2) | box centres; absent boxes lie 100 cells away and more | state, privileged |
     | ``abstract_state`` | float32 (10, 10, 4) | walls, targets, agent, boxes by cell, row 0 north | state, privileged |
     | ``top_down`` | uint8 (64, 64, 3) | camera above the grid, RGB, north up | privileged |
 

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 _STAGE_NONE: Final = int(mujoco.mjtStage.mjSTAGE_NONE)
 _STAGE_VELOCITY: Final = int(mujoco.mjtStage.mjSTAGE_VEL)
 _HEADING_STREAM: Final = 1
-"""Tells the heading's random stream from others that an episode's seed governs."""
+"""Tells the heading's random stream from others that an episode's seed governs, but for the generator's of levels of
+difficulty 1, which is the same: their robots' headings go with the first step of the walk that makes the room."""
 
 
 _DYNAMIC: Final = (
@@ -72,7 +73,7 @@ class World(Portable):
         agent_cell: (row, column) of the robot, int64 [B, 2]. If it rounds into a box's cell it keeps its last cell.
         box_cell: (row, column) of the boxes, int64 [B, K, 2]; (-1, -1) for those that a level lacks.
         box_on_target: bool [B, K]. A box is on a target when at least half of it in both axes lies within the pad.
-        boxes_on_target: number of boxes on targets, int64 [B].
+        boxes_on_target: number of targets with a box on them, int64 [B].
         reward: of the last step: +1 for a box onto a target, -1 off one, +10 for solving; float32 [B].
         episode_return: sum of the rewards, float32 [B].
         steps: steps of the episode so far, int64 [B].

@@ -143,10 +143,10 @@ def _observe_boxes(
     cell: NDArray[np.int64],
     on_target: NDArray[np.bool_],
 ) -> int:
-    """Fill position [K, 2], speed [K], cell [K, 2] and on_target [K] of a world's boxes; return how many are on.
+    """Fill position [K, 2], speed [K], cell [K, 2] and on_target [K] of a world's boxes; return how many pads have one.
 
     At least half of a box, in both axes, lies within a pad exactly when its centre does, so the pad that counts is that
-    of the box's cell.
+    of the box's cell. The centres of two boxes fit into one cell, side by side: the second one counts for nothing.
     """
     total = 0
     for k in range(position.shape[0]):
@@ -158,12 +158,20 @@ def _observe_boxes(
             row, col = _cell(x, y, cell_size)
             cell[k, 0], cell[k, 1] = row, col
             on = target[row, col]
+            total += int(on and not _is_among(row, col, cell[:k]))
         else:
             cell[k, 0] = cell[k, 1] = -1
             on = False
         on_target[k] = on
-        total += int(on)
     return total
+
+
+@njit(cache=True, nogil=True)
+def _is_among(row: int, col: int, cells: NDArray[np.int64]) -> bool:
+    found = False
+    for k in range(cells.shape[0]):
+        found |= cells[k, 0] == row and cells[k, 1] == col
+    return found
 
 
 @njit(cache=True, nogil=True)
@@ -172,9 +180,8 @@ def _locate_agent(
 ) -> None:
     """Update the agent's cell [2]; one that rounds into a box's cell keeps its last cell."""
     row, col = _cell(x, y, cell_size)
-    for k in range(box_cell.shape[0]):
-        if box_cell[k, 0] == row and box_cell[k, 1] == col:
-            return
+    if _is_among(row, col, box_cell):
+        return
     agent_cell[0], agent_cell[1] = row, col
 
 

@@ -82,6 +82,10 @@ class LazyEpisodes(Sequence[EpisodeSpec]):
     def _make(self, index: int) -> EpisodeSpec:
         """Return episode `index`, the same whenever it is made."""
 
+    def number(self, index: int) -> int:
+        """Return the number of episode `index` within its run, from 1 on: modules' random streams depend on it."""
+        return index + 1
+
     def __getstate__(self) -> dict[str, Any]:
         """Return all but what was made."""
         return {name: value for name, value in vars(self).items() if name != "_made"}

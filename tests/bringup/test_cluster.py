@@ -8,9 +8,15 @@ import numpy as np
 from toy_actors import die_once
 
 from bringup import evaluate, record
-from bringup.cluster import spread
+from bringup.cluster import EveryNth, spread
+from bringup.rollout import ticks
+from mujoban_baselines.random_agent import RandomAgent
+from mujoban_core.agent import AgentPolicy
 from mujoban_core.plugins import ROLES
 from mujoban_msgs_py.bags import open_bag
+from mujoban_sim.world import World
+from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import VALIDATION_SEEDS
 
 EPISODES = ["--difficulty", "1", "--episodes", "3", "--oracle", ",".join(ROLES)]
 
@@ -23,6 +29,22 @@ def test_an_evaluation_on_a_cluster_says_the_same_as_one_here(tmp_path, ray_clus
         reports[name] = json.loads(file.read_text())
     assert len(reports["here"]["episodes"]) == 3
     assert reports["here"] == reports["cluster"]
+
+
+def test_a_share_of_a_run_draws_as_the_whole_does():
+    """A cluster's processes play every n-th episode each; who draws at random draws by the episode's number."""
+    whole = Episodes(5, VALIDATION_SEEDS.start, difficulty=1)
+
+    def torques(episodes, batch):
+        world = World(min(batch, len(episodes)), max_boxes=1, time_limit=3)
+        found = {}
+        for tick in ticks(AgentPolicy(RandomAgent()), world, episodes):
+            for row, index in enumerate(tick.episode.tolist()):
+                found.setdefault(episodes[index].seed, []).append(tick.decision.torque[row].tolist())
+        return found
+
+    shares = [torques(EveryNth(whole, first, 2), 2) for first in range(2)]
+    assert shares[0] | shares[1] == torques(whole, 2)
 
 
 def test_a_recording_on_a_cluster_says_the_same_as_one_here(tmp_path, ray_cluster):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bringup.evaluate import evaluate
-from bringup.failure import is_unsolvable, playable_region
+from bringup.failure import DecisionRecord, explain, is_unsolvable, playable_region
 from bringup.results import EpisodeResult, Failure, report
 from bringup.rollout import ticks
 from mujoban_core.grid import AGENT, BOX, TARGET, WALL, Instruction
@@ -15,6 +15,7 @@ from mujoban_sim.oracles import OracleController, OracleEstimator
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.levels import Level, write_levels
+from mujoban_sokoban.rules import abstract_successor
 
 CORNER = """\
 ######
@@ -161,3 +162,12 @@ def test_bad_runs_of_episodes_are_refused(bad):
     options = {"count": 1, "seed": 0} | bad
     with pytest.raises(ValueError, match=str(next(iter(bad.values())))):
         Episodes(options.pop("count"), options.pop("seed"), **options)
+
+
+def test_a_level_that_the_last_instruction_loses_is_lost_by_it():
+    before = Level.from_text("######\n#   .#\n# $@ #\n#    #\n######").abstract_state() > 0.5
+    decision = DecisionRecord(before, int(Instruction.WEST), estimate_right=True, timed_out=False)
+    after = abstract_successor(before, Instruction.WEST)
+    assert is_unsolvable(after) and not is_unsolvable(before)
+    assert explain([decision], after) == Failure.PLANNER_DEAD_END
+    assert explain([decision], before) == Failure.TIME_LIMIT

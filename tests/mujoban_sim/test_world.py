@@ -75,6 +75,22 @@ def test_a_box_is_on_a_target_when_half_of_it_in_both_axes_is_on_the_pad():
         assert world.box_on_target[0].tolist() == [on, False]
 
 
+def test_two_boxes_side_by_side_on_one_pad_count_as_one():
+    """A robot that rolls on pushes both: the level is not solved while its other pad is empty."""
+    level = Level.from_text("##########\n#        #\n#@ $*   .#\n#        #\n##########")
+    world = World(1, max_boxes=2)
+    world.reset([0], [EpisodeSpec(level, 0)])
+    world.place([0], [[*cell_to_xy(level.player), 0.0]], cell_to_xy(level.boxes)[None])
+    twice = False
+    for _ in range(60):
+        world.step(np.array([[1.0, 0.0]], np.float32))
+        twice |= bool(world.box_on_target[0].all())
+        assert world.boxes_on_target[0] <= 1 and not world.done[0]
+    assert twice, "both were on the pad at once"
+    state = world.abstract_state()[0]
+    assert world.boxes_on_target[0] == (state[..., BOX] * state[..., TARGET]).sum()
+
+
 def test_rewards_for_boxes_onto_and_off_targets_and_for_solving():
     world = room_world()
     far = cell_to_xy((8, 8))
