@@ -46,6 +46,9 @@ class Options:
     batch: Count = 64
     """Episodes that run at the same time."""
     shared: Annotated[ClusterOptions, arg(name="")] = field(default_factory=ClusterOptions)
+    first_number: Count = 1
+    """Number of the first episode, where these are a part of a longer run: what modules draw at random follows from it,
+    and would else be the same in every part."""
     graph: bool = False
     """Play through the ROS graph instead."""
     json: FilePath = None
@@ -55,6 +58,8 @@ class Options:
         """Reject what contradicts itself."""
         if self.graph and self.shared.cluster:
             raise ValueError("--graph --cluster: expected one of the two, since the graph plays on this machine")
+        if self.graph and self.first_number != 1:
+            raise ValueError(f"--first-number {self.first_number}: expected 1 with --graph, which counts from there")
 
 
 def evaluate(
@@ -106,6 +111,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         options = replace(options, play=replace(options.play, episodes=_EPISODES))
     play = options.play
     episodes = play.make(play.seed, VALIDATION_SEEDS)
+    episodes.first_number = options.first_number
     stack = options.modules.player(play.body)
     set_threads(stack.threads)
     reporting = Reporting(options.json, stack.identities(), episodes, played(stack, episodes, play))

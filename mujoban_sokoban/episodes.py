@@ -153,7 +153,13 @@ class Episodes(LazyEpisodes):
             raise ValueError(f"{count} episodes: expected at least 1")
         self.level_file = level_file
         self.seed = seed
+        self.first_number = 1
+        """Number of the first episode; another one where these are a part of a longer run."""
         super().__init__(count if count is not None else max(len(self.source.levels), 1))
+
+    def number(self, index: int) -> int:
+        """Return the number of an episode within the run that these are a part of."""
+        return self.first_number + index
 
     @property
     def difficulty(self) -> int:

@@ -53,6 +53,8 @@ class Part:
         """Measure it in a process of its own."""
         command = [sys.executable, "bringup/evaluate.py", *self.run.options(), "--seed", str(SEED + self.first)]
         command += ["--episodes", str(self.episodes), "--json", str(self.file)]
+        if "--graph" not in command:
+            command += ["--first-number", str(self.first + 1)]
         self.file.parent.mkdir(parents=True, exist_ok=True)
         with self.file.with_suffix(".log").open("wb") as log:
             return subprocess.Popen(command, cwd=ROOT, stderr=log, env={**os.environ, "OMP_NUM_THREADS": "1"})

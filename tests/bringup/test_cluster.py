@@ -45,6 +45,9 @@ def test_a_share_of_a_run_draws_as_the_whole_does():
 
     shares = [torques(EveryNth(whole, first, 2), 2) for first in range(2)]
     assert shares[0] | shares[1] == torques(whole, 2)
+    parts = [Episodes(2, whole.seed, difficulty=1), Episodes(3, whole.seed + 2, difficulty=1)]
+    parts[1].first_number = 3
+    assert torques(parts[0], 2) | torques(parts[1], 2) == torques(whole, 2)
 
 
 def test_a_recording_on_a_cluster_says_the_same_as_one_here(tmp_path, ray_cluster):
