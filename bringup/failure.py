@@ -107,13 +107,15 @@ def estimate_is_right(
 def is_unsolvable(state: NDArray[np.bool_]) -> bool:
     """Tell whether the rules prove that an abstract state, [N, N, 4], can no longer be solved.
 
-    States that the rules do not know, such as two boxes that round into one cell, or no wall around, are not proven.
+    States that the rules do not know, such as two boxes that round into one cell, a box in the cell that the robot has
+    half left, or no wall around, are not proven.
     """
     boxes = np.argwhere(state[..., BOX])
     player = np.argwhere(state[..., AGENT])
     regular = len(boxes) == state[..., TARGET].sum() and len(player) == 1
     wall = state[..., WALL]
-    if not regular or not walls_around(wall) or (wall & (state[..., BOX] | state[..., AGENT])).any():
+    shared = (wall & (state[..., BOX] | state[..., AGENT])) | (state[..., BOX] & state[..., AGENT])
+    if not regular or not walls_around(wall) or shared.any():
         return False
     row, column = player[0]
     solution = solve(

@@ -171,3 +171,13 @@ def test_a_level_that_the_last_instruction_loses_is_lost_by_it():
     assert is_unsolvable(after) and not is_unsolvable(before)
     assert explain([decision], after) == Failure.PLANNER_DEAD_END
     assert explain([decision], before) == Failure.TIME_LIMIT
+
+
+def test_a_box_in_the_cell_that_the_robot_has_half_left_proves_nothing():
+    """It keeps its cell while it rounds into a box's; another box may be pushed into that meanwhile."""
+    state = Level.from_text("######\n#$   #\n# @ .#\n#    #\n######").abstract_state() > 0.5
+    assert is_unsolvable(state)
+    row, column = np.argwhere(state[..., BOX])[0]
+    state[..., AGENT] = False
+    state[row, column, AGENT] = True
+    assert not is_unsolvable(state) and explain([], state) == Failure.TIME_LIMIT
