@@ -71,7 +71,7 @@ def test_the_graph_and_the_rollout_record_the_same_of_an_episode(oracles, tmp_pa
         for tick in ticks(oracles.policy(), world, episodes, camera=True):
             recorder.write(tick)
     assert open_bag(tmp_path / "graph").about == open_bag(tmp_path / "row000").about
-    assert open_bag(tmp_path / "graph").about == {"body": "ball", "world": DEFAULT_WORLD}
+    assert open_bag(tmp_path / "graph").about == {"body": "ball", "world": DEFAULT_WORLD, "max_boxes": "1"}
     graph, rollout = said(tmp_path / "graph"), said(tmp_path / "row000")
     for topic in graph:
         assert graph[topic] == rollout[topic], topic
