@@ -114,8 +114,7 @@ def is_unsolvable(state: NDArray[np.bool_]) -> bool:
     player = np.argwhere(state[..., AGENT])
     regular = len(boxes) == state[..., TARGET].sum() and len(player) == 1
     wall = state[..., WALL]
-    shared = (wall & (state[..., BOX] | state[..., AGENT])) | (state[..., BOX] & state[..., AGENT])
-    if not regular or not walls_around(wall) or shared.any():
+    if not regular or not walls_around(wall) or (state[..., [WALL, BOX, AGENT]].sum(-1) > 1).any():
         return False
     row, column = player[0]
     solution = solve(

@@ -102,15 +102,15 @@ class Recorder:
             tick: The tick.
             check: Called before each row; all bags are whole also where it raises.
         """
-        # Physics are the same to the last bit where there is room for as many boxes.
-        about = {"body": self._body.name, "world": self._world, "max_boxes": str(tick.truth.box_position.shape[1])}
         for m, number in enumerate(tick.rows.tolist()):
             check()
             if number not in self._rows:
                 path = self._path / f"{self._prefix}row{number:03d}"
+                # Physics are the same to the last bit where there is room for as many boxes.
+                room = str(tick.truth.box_position.shape[1])
                 writer = BagWriter(
                     path, TOPICS, episodes_per_file=self._episodes_per_file, flush_after=FLUSH_AFTER,
-                    about=about,
+                    about={"body": self._body.name, "world": self._world, "max_boxes": room},
                 )  # fmt: skip
                 self._rows[number] = _Row(writer, TickComposer(self._body))
             self._write_row(self._rows[number], tick, m)

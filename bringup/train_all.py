@@ -17,6 +17,7 @@ if __name__ == "__main__":
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -147,10 +148,10 @@ class Options:
         missing = [] if self.before is None else [path for path in needed if not (self.before / path).exists()]
         if missing:
             raise ValueError(f"--continue {self.before}: lacks {missing[0]}, expected the directory of a finished run")
-        if self.before is not None and self.stream == seed_of(self.before):
+        if self.before is not None and self.seed is not None and self.seed == seed_of(self.before):
             raise ValueError(f"--seed {self.stream}: the levels of {self.before} again, expected another seed")
 
-    @property
+    @cached_property
     def stream(self) -> int:
         """The seed of all stages."""
         if self.seed is not None:

@@ -5,7 +5,7 @@ Shape legend: T steps of an unroll, which holds T + 1 ticks, B robots. A tick is
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +23,7 @@ from mujoban_rl.exploration import Exploration, check_exploration
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.vtrace import VTraceConfig, VTraceStats, vtrace_loss
 from mujoban_rl.optimise import ProgressSchedule, guarded_step
+from mujoban_rl.progress import Meter
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
 
@@ -101,16 +102,13 @@ class VTraceLearner(Learner[Arrays]):
         self._schedule.follow(progress)
         # Shape [B, T + 1, ...].
         ticks = {name: torch.from_numpy(values).transpose(0, 1) for name, values in batch.items()}
-        told = [self._learn(dict(zip(ticks, part, strict=True)), guard) for part in self._parts(ticks)]
-        taken = [scalars for scalars in told if scalars]
-        if not taken:
-            return {}
-        self._normalise(ticks["proprio"][:, 0])
-        return {name: sum(scalars[name] for scalars in taken) / len(taken) for name in taken[0]}
-
-    def _parts(self, ticks: Mapping[str, Tensor]) -> Iterator[tuple[Tensor, ...]]:
-        """Yield the unrolls of so many robots at a time as a step learns from."""
-        return zip(*(values.split(self.config.batch) for values in ticks.values()), strict=True)
+        meter, batch_size = Meter(), self.config.batch
+        for start in range(0, len(ticks["first"]), batch_size):
+            part = {name: values[start : start + batch_size] for name, values in ticks.items()}
+            meter.add(self._learn(part, guard))
+        if meter:
+            self._normalise(ticks["proprio"][:, 0])
+        return meter.take()
 
     def _learn(self, ticks: Mapping[str, Tensor], guard: NaNGuard) -> dict[str, float]:
         """Take a step on some robots' unrolls, [B, T + 1, ...] each; return what to log, nothing if it was refused."""

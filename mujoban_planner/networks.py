@@ -55,11 +55,6 @@ class ResidualPlanner(LearnedPlanner):
         return self.blocks(self.encoder(planes))
 
     @property
-    def rereads(self) -> bool:
-        """Longer thinking takes more views of the board, and reads each as before."""
-        return False
-
-    @property
     def views(self) -> int:
         """Symmetric views of the board that go into one decision, at most 8."""
         return min(max(self.thinking, 1), SYMMETRIES)
@@ -108,11 +103,6 @@ class ThinkingPlanner(ResidualPlanner):
         for _ in range(max(self.thinking, 1)):
             x = self.blocks[-self._tied :](x)
         return x
-
-    @property
-    def rereads(self) -> bool:
-        """Repeated blocks read more."""
-        return True
 
     @property
     def views(self) -> int:

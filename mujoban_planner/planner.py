@@ -215,8 +215,8 @@ class LearnedPlanner(Compilable, Planner):
 
     @property
     def rereads(self) -> bool:
-        """Whether `read`, and with it a search ahead, depends on the thinking time."""
-        return True
+        """Whether longer thinking is to read a board again, as a search then does too, and not to see more views."""
+        return self.thinking > 1 and self.views == 1
 
     @property
     def views(self) -> int:

@@ -80,8 +80,7 @@ def grow(forest: Forest, rows: NDArray[np.int64], evaluate: Evaluation) -> None:
 def evaluate_boards(planner: LearnedPlanner, boards: BitBoards) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return how promising pushes are, as log-probabilities, [M, 4, I * I], and log p(alive), [M]."""
     states = state_tensor(boards)
-    once = planner.thinking == 1 or not planner.rereads
-    if planner.compiled is not None and once and len(states) == 1:
+    if planner.compiled is not None and not planner.rereads and len(states) == 1:
         return _judge_one(planner.compiled, states.numpy())
     push, alive = _judge(planner, states.to(planner.device))
     return push.cpu().numpy(), alive.cpu().numpy()
