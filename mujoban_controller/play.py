@@ -21,7 +21,7 @@ from mujoban_controller.judge import OutcomeSummary
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_core.interfaces import ControllerInput, Memory, renew_rows
 from mujoban_rl.engine import Scalars, Source, State
-from mujoban_rl.replay import SequenceBuilder, SequenceReplay
+from mujoban_rl.replay import TickReplay
 
 Fields = dict[str, NDArray]
 Batch = dict[str, Tensor]
@@ -253,10 +253,6 @@ class Draw:
     critic: CriticDraw | None = None
     """What is drawn for a critic beside it."""
 
-    def builder(self, window: int) -> SequenceBuilder:
-        """Return what joins ticks to sequences that overlap: windows shorter than these begin at every tick alike."""
-        return SequenceBuilder(self.length, window - 1 if window < self.length else 0)
-
 
 class ReplaySource(Source[Batch]):
     """Windows of W successive ticks, drawn evenly from what a player has played last, and from recordings beside it."""
@@ -273,10 +269,9 @@ class ReplaySource(Source[Batch]):
             recorded: Gives ticks of recordings, which are kept beside those of the player, [R, ...] each.
         """
         self._player, self._draw, self._generator, self._recorded = player, draw, generator, recorded
-        self._replay = SequenceReplay(draw.capacity, draw.length)
-        self._long = None if draw.critic is None else SequenceReplay(draw.critic.capacity, draw.length)
-        self._builder = draw.builder(draw.window)
-        self._long_builder = None if draw.critic is None else draw.builder(draw.critic.window)
+        self._replay = TickReplay(draw.capacity, draw.length, draw.window)
+        critic = draw.critic
+        self._long = None if critic is None else TickReplay(critic.capacity, draw.length, critic.window)
         self._due, self._ticks = 0.0, 0
         self._summary = OutcomeSummary()
 
@@ -296,11 +291,11 @@ class ReplaySource(Source[Batch]):
         while self._due < 1.0 or not self._replay.added:
             self._play()
         self._due -= 1.0
-        batch = self._replay.sample(self._draw.windows, self._generator, self._draw.window)
+        batch = self._replay.sample(self._draw.windows, self._generator)
         critic = self._draw.critic
         if self._long is None or critic is None:
             return batch
-        beside = self._long.sample(critic.updates * critic.windows, self._generator, critic.window)
+        beside = self._long.sample(critic.updates * critic.windows, self._generator)
         return batch | {CRITIC + name: x.unflatten(0, (critic.updates, critic.windows)) for name, x in beside.items()}
 
     def _play(self) -> None:
@@ -310,12 +305,9 @@ class ReplaySource(Source[Batch]):
         if self._recorded is not None:
             beside, _ = self._recorded.tick()
             tick = {name: np.concatenate([values, beside[name]]) for name, values in tick.items()}
-        if (sequence := self._builder.add(tick)) is not None:
-            self._replay.add(sequence)
-        if self._long is not None and self._long_builder is not None:
-            sequence = self._long_builder.add({name: tick[name] for name in CRITIC_FIELDS})
-            if sequence is not None:
-                self._long.add(sequence)
+        self._replay.add(tick)
+        if self._long is not None:
+            self._long.add({name: tick[name] for name in CRITIC_FIELDS})
         self._ticks += 1
         if self._ticks >= self._draw.first:
             self._due += self._draw.per_tick
@@ -328,11 +320,11 @@ class ReplaySource(Source[Batch]):
     def state(self) -> State:
         """Return the replay, the player's state and what draws from them."""
         own = State({"due": self._due, "ticks": self._ticks}, {"generator": self._generator.get_state()})
-        parts = {"player": self._player.state(), "replay": self._replay.state(), "builder": self._builder.state()}
+        parts = {"player": self._player.state(), "replay": self._replay.state()}
         if self._recorded is not None:
             parts["recorded"] = self._recorded.state()
-        if self._long is not None and self._long_builder is not None:
-            parts |= {"long": self._long.state(), "long_builder": self._long_builder.state()}
+        if self._long is not None:
+            parts["long"] = self._long.state()
         return State.of({**parts, "own": own})
 
     def restore(self, state: State) -> None:
@@ -341,12 +333,8 @@ class ReplaySource(Source[Batch]):
         if self._recorded is not None:
             self._recorded.restore(state.part("recorded"))
         self._replay.restore(state.part("replay"))
-        self._builder.restore(state.part("builder"))
         if self._long is not None:
             self._long.restore(state.part("long"))
-        # Checkpoints of earlier versions have none.
-        if self._long_builder is not None and "long_builder" in state.values:
-            self._long_builder.restore(state.part("long_builder"))
         own = state.part("own")
         self._due, self._ticks = own.values["due"], own.values["ticks"]
         self._generator.set_state(own.tensors["generator"])

@@ -142,6 +142,44 @@ class SequenceBuilder:
         self._ticks = [{name: values[i] for name, values in columns.items()} for i in range(count)]
 
 
+class TickReplay:
+    """A replay that takes ticks one by one and gives windows of one length, which begin at every tick equally often."""
+
+    def __init__(self, capacity: int, length: int, window: int) -> None:
+        """Hold up to `capacity` sequences of `length` ticks, and draw windows of `window`.
+
+        Raises:
+            ValueError: If a number is not positive.
+        """
+        self.window = window
+        self._replay = SequenceReplay(capacity, length)
+        # Whole sequences have one start each, wherever they begin.
+        self._builder = SequenceBuilder(length, window - 1 if window < length else 0)
+
+    @property
+    def added(self) -> int:
+        """Sequences added so far."""
+        return self._replay.added
+
+    def add(self, tick: Ticks) -> None:
+        """Add a tick, fields [B, ...]; it is drawn from once its sequence is whole."""
+        if (sequence := self._builder.add(tick)) is not None:
+            self._replay.add(sequence)
+
+    def sample(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Return M = `count` windows, fields [M, W, ...]; see `SequenceReplay.sample`."""
+        return self._replay.sample(count, generator, self.window)
+
+    def state(self) -> State:
+        """Return all that is held."""
+        return State.of({"replay": self._replay.state(), "builder": self._builder.state()})
+
+    def restore(self, state: State) -> None:
+        """Take over what `state` returned."""
+        self._replay.restore(state.part("replay"))
+        self._builder.restore(state.part("builder"))
+
+
 def _array(values: NDArray[Any] | Tensor) -> NDArray[Any]:
     return values.numpy() if isinstance(values, Tensor) else values
 

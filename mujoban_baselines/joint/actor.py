@@ -38,6 +38,9 @@ SEEN: Final = GRID_SIZE * GRID_SIZE * len(CHANNELS) + NEIGHBOURS
 DECISION: Final = "decision/"
 """Begins the names of what is delivered of decisions."""
 
+_QUARTERS: Final = -np.round(np.arctan2(INSTRUCTION_AXES[:, 1], INSTRUCTION_AXES[:, 0]) / (np.pi / 2))
+"""Quarter turns of the map that bring an instruction's direction along its rows."""
+
 
 def around_instruction(world: World) -> NDArray[np.float32]:
     """Return the true map, turned so that the instruction points along its rows, and which neighbours are targets.
@@ -47,9 +50,9 @@ def around_instruction(world: World) -> NDArray[np.float32]:
     """
     state, direction = world.abstract_state(), world.goals.direction
     turned = state.copy()
-    for rotated, (x, y) in zip(np.unique(direction), INSTRUCTION_AXES[np.unique(direction)], strict=True):
+    for rotated in np.unique(direction):
         rows = direction == rotated
-        turned[rows] = np.rot90(state[rows], -round(np.arctan2(y, x) / (np.pi / 2)), (1, 2))
+        turned[rows] = np.rot90(state[rows], int(_QUARTERS[rotated]), (1, 2))
     cells = neighbour_cells(world)
     targets = state[np.arange(world.batch)[:, None], cells[..., 0], cells[..., 1], TARGET]
     return np.concatenate([turned.reshape(world.batch, -1), targets], 1, dtype=np.float32)
