@@ -32,8 +32,8 @@ from bringup.training_seed import seed_of
 from bringup.training_sizes import Machine
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.program import read_options, run_command
-from mujoban_planner.training_levels import LAST_SEED
-from mujoban_sokoban.generator import FRESH_SEEDS, TRAIN_SEEDS
+from mujoban_planner.seed_streams import LAST_SEED
+from mujoban_sokoban.generator import FRESH_SEEDS, SENSES_SEEDS, TRAIN_SEEDS
 
 PROG = "bringup.train_all"
 WEIGHTS: Final = {
@@ -107,8 +107,6 @@ _VIEWS: Final = ("--noise", "0.05", "--hidden", "0.1")
 """Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
 _LEVELS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
-_VALIDATION_BAGS: Final = 8_000_000
-"""Seed of the first level of the bags on which the senses are judged."""
 _VALIDATION_PER_HOUR: Final = 6
 """Episodes of them, per hour of the whole run; at most 32."""
 
@@ -338,7 +336,7 @@ def _validation(options: Options) -> Stage:
     name = "bags_validation"
     first, run = _recording(options, "bags_first"), options.run
     episodes = max(4, min(32, round(_VALIDATION_PER_HOUR * options.hours)))
-    replaced = {"--out": str(run / name), "--episodes": str(episodes), "--seed": str(_VALIDATION_BAGS)}
+    replaced = {"--out": str(run / name), "--episodes": str(episodes), "--seed": str(SENSES_SEEDS.start)}
     command = list(first.command)
     for option, value in replaced.items():
         command[command.index(option) + 1] = value

@@ -18,8 +18,8 @@ from torch import Tensor
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch
+from mujoban_planner.seed_streams import stream_number
 from mujoban_planner.symmetry import SYMMETRIES
-from mujoban_planner.training_levels import stream_number
 from mujoban_planner.uncertainty import Uncertainty, UncertaintyConfig
 from mujoban_planner.validation import NetworkConfig, Shares, check_mix, difficulty_shares
 from mujoban_rl.actors import Actor, ActorPool, Experience

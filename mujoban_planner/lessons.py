@@ -15,10 +15,11 @@ from mujoban_planner.boards import join_levels, take_levels
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import Game, play
 from mujoban_planner.samples import Samples, concatenate, make_batch
+from mujoban_planner.seed_streams import LESSONS, first_seed
 from mujoban_planner.teacher import Teacher, label_deadly, possible_pushes
 from mujoban_rl.engine import State
 from mujoban_rl.precision import autocast
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
+from mujoban_sokoban.generator import generate_batch
 from mujoban_sokoban.levels import LevelBatch
 from mujoban_sokoban.solver import Status
 
@@ -40,7 +41,6 @@ _LOST_LEVELS: Final = 4096
 """Lost levels kept of each difficulty."""
 _FORWARD: Final = 1024
 """States in one forward pass."""
-_SEEDS_PER_STREAM: Final = 10**12
 
 
 class LessonMaker:
@@ -59,11 +59,9 @@ class LessonMaker:
             long_moves: Moves of the shortest solution that counts as long.
 
         Raises:
-            ValueError: If the stream has no seeds left in `TRAIN_SEEDS`.
+            ValueError: If there is no such stream.
         """
-        self._next = TRAIN_SEEDS.start + stream * _SEEDS_PER_STREAM
-        if stream < 0 or self._next not in TRAIN_SEEDS:
-            raise ValueError(f"stream {stream}: expected a number whose seeds lie in {TRAIN_SEEDS}")
+        self._next = first_seed(LESSONS, stream)
         self._rng = np.random.default_rng([stream, 1])
         self._mix = {d: share / sum(mix.values()) for d, share in mix.items() if share > 0}
         self._teacher = Teacher()

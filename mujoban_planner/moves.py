@@ -22,17 +22,15 @@ from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.discrete_mpo import MPOSettings
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_planner.training_levels import stream_number
+from mujoban_planner.seed_streams import MOVES, first_seed, stream_number
 from mujoban_planner.validation import Shares, check_mix, difficulty_shares
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
 from mujoban_rl.precision import autocast
 from mujoban_rl.replay import SequenceBuilder
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
+from mujoban_sokoban.generator import generate_batch
 
 _STATE: Final = (GRID_SIZE, GRID_SIZE, len(CHANNELS))
-_FIRST_STREAM: Final = 600_000
-_SEEDS_PER_STREAM: Final = 10**12
 
 
 @dataclass(frozen=True)
@@ -68,12 +66,9 @@ class LevelStream:
         """Draw difficulties by `mix`; `seed` and `stream` choose difficulties and levels.
 
         Raises:
-            ValueError: If the stream has no training seeds.
+            ValueError: If there is no such stream.
         """
-        number = _FIRST_STREAM + stream_number(seed, stream)
-        self.next_seed = TRAIN_SEEDS.start + number * _SEEDS_PER_STREAM
-        if self.next_seed not in TRAIN_SEEDS:
-            raise ValueError(f"stream {stream} of seed {seed}: expected one of a small seed")
+        self.next_seed = first_seed(MOVES, stream_number(seed, stream))
         self._rng = np.random.default_rng([seed, 2, stream])
         self._difficulties, shares = np.array(list(mix)), np.array(list(mix.values()))
         self._shares = shares / shares.sum()

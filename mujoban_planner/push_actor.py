@@ -19,7 +19,8 @@ from mujoban_core.ranges import check_counts, check_positive
 from mujoban_planner.boards import BitBoards
 from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.push_policy import PushPolicy
-from mujoban_planner.training_levels import LevelConfig, Ticket, TrainingLevels, stream_number
+from mujoban_planner.seed_streams import stream_number
+from mujoban_planner.training_levels import LevelConfig, Ticket, TrainingLevels
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State

@@ -30,9 +30,10 @@ from mujoban_planner.forest import Forest, Verdicts
 from mujoban_planner.lessons import errs
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch, unlabelled
 from mujoban_planner.search import GraphedEvaluation, evaluate_boards, grow
+from mujoban_planner.seed_streams import stream_number
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import DEAD_SHARE, judge_instructions, label_dead, label_demonstrations, possible_pushes
-from mujoban_planner.training_levels import LevelConfig, Ticket, TrainingLevels, stream_number
+from mujoban_planner.training_levels import LevelConfig, Ticket, TrainingLevels
 from mujoban_planner.uncertainty import Uncertainty, UncertaintyConfig
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import Actor, Experience

@@ -18,15 +18,13 @@ from numpy.typing import NDArray
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.ranges import check_counts, check_shares
 from mujoban_planner.boards import BitBoards, bit_boards
+from mujoban_planner.seed_streams import LEVELS, first_seed
 from mujoban_planner.shortening import shorten
 from mujoban_rl.engine import State
 from mujoban_sokoban.bitboard import pushed
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
+from mujoban_sokoban.generator import generate_batch
 from mujoban_sokoban.solver_labels import count_moves
 
-_STREAMS_PER_SEED: Final = 1000
-"""Streams of levels that one seed may use up, one for each actor."""
-_SEEDS_PER_STREAM: Final = 10**12
 _MEMORY: Final = 0.995
 """What a solve rate keeps of itself when one more level of its difficulty ends."""
 _LEAST: Final = 0.02
@@ -41,20 +39,6 @@ _KEPT_FAILURES: Final = 20_000
 _KEPT_LONG: Final = 4096
 _LEAVES: Final = 0.1
 """Chance that a level which was lost at first is not drawn any more once it is won; and a long one whenever it is."""
-_STREAMS: Final = TRAIN_SEEDS.start + 700_000 * _SEEDS_PER_STREAM
-LAST_SEED: Final = (TRAIN_SEEDS.stop - _STREAMS) // (_STREAMS_PER_SEED * _SEEDS_PER_STREAM) - 1
-"""The largest seed of a run whose every stream has levels."""
-
-
-def stream_number(seed: int, stream: int) -> int:
-    """Return which of all runs' streams an actor has: the `stream`-th of a run with this seed.
-
-    Raises:
-        ValueError: If the seed is negative, or has no such stream.
-    """
-    if seed < 0 or not 0 <= stream < _STREAMS_PER_SEED:
-        raise ValueError(f"stream {stream} of seed {seed}: expected 0 to {_STREAMS_PER_SEED - 1} of a seed from 0 on")
-    return _STREAMS_PER_SEED * seed + stream
 
 
 @dataclass(frozen=True)
@@ -128,11 +112,9 @@ class TrainingLevels:
             retries: How often such a level comes again.
 
         Raises:
-            ValueError: If the stream has no training seeds.
+            ValueError: If there is no such stream.
         """
-        self._next = _STREAMS + stream * _SEEDS_PER_STREAM
-        if stream < 0 or self._next + _SEEDS_PER_STREAM - 1 not in TRAIN_SEEDS:
-            raise ValueError(f"stream {stream}: expected a number whose seeds lie in {TRAIN_SEEDS}, as of a small seed")
+        self._next = first_seed(LEVELS, stream)
         self._rng = np.random.default_rng([stream, 3])
         self._config, self._retried, self._retries = config or LevelConfig(), retried, retries
         self._solved, self._tried = np.zeros((2, len(DIFFICULTIES)))

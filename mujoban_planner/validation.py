@@ -12,10 +12,9 @@ from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, Thinking
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.play import play
 from mujoban_rl.weights import WeightsError, read_record
-from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_batch
+from mujoban_sokoban.generator import PLANNER_SEEDS, generate_batch
 from mujoban_sokoban.levels import LevelBatch
 
-_FIRST_SEED: Final = 9_000_000
 _EPISODES: Final = {5: 256, 4: 64, 1: 64}
 """Difficulty -> episodes of a periodic evaluation."""
 
@@ -107,9 +106,8 @@ class NetworkConfig:
 
 def validation_levels(difficulty: int, n: int) -> LevelBatch:
     """Return `n` held-out levels."""
-    seeds = range(_FIRST_SEED, _FIRST_SEED + n)
-    assert seeds[0] in VALIDATION_SEEDS and seeds[-1] in VALIDATION_SEEDS
-    return generate_batch(difficulty, seeds)
+    assert n <= len(PLANNER_SEEDS)
+    return generate_batch(difficulty, PLANNER_SEEDS[:n])
 
 
 def success_rates(planner: LearnedPlanner) -> dict[str, float]:

@@ -29,6 +29,10 @@ VALIDATION_SEEDS: Final = range(5_000_000, 10_000_000)
 """Seeds for tuning: to be looked at as often as one likes."""
 FRESH_SEEDS: Final = range(7_000_000, 8_000_000)
 """Those of validation by which no trainer chooses what it keeps: what `make weights` reports is measured on them."""
+SENSES_SEEDS: Final = range(8_000_000, 9_000_000)
+"""Those of validation that `make weights` records, to judge the senses on."""
+PLANNER_SEEDS: Final = range(9_000_000, 9_500_000)
+"""Those of validation by which the planner's trainers choose what they keep."""
 PLAY_SEEDS: Final = range(9_500_000, 10_000_000)
 """Those of validation by which nothing is chosen: what is played where nobody gives a seed."""
 TRAIN_SEEDS: Final = range(10_000_000, 2**62)

@@ -22,7 +22,8 @@ from bringup.training_report import EVALUATIONS, write_report
 from mujoban_core.program import read_options
 from mujoban_planner.expert_iteration import ExpertIterationConfig
 from mujoban_planner.growth import start_from
-from mujoban_planner.training_levels import LAST_SEED, TrainingLevels, stream_number
+from mujoban_planner.seed_streams import LAST_SEED, stream_number
+from mujoban_planner.training_levels import TrainingLevels
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.weights import save_weights
 from mujoban_sokoban.generator import VALIDATION_SEEDS, seed_range

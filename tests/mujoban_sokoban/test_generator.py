@@ -1,6 +1,7 @@
 import hashlib
 import subprocess
 import sys
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -9,6 +10,10 @@ from hypothesis import strategies as st
 
 from mujoban_core.grid import DIFFICULTIES, GRID_SIZE, OFFSETS_RC
 from mujoban_sokoban.generator import (
+    FRESH_SEEDS,
+    PLANNER_SEEDS,
+    PLAY_SEEDS,
+    SENSES_SEEDS,
     TEST_SEEDS,
     TRAIN_SEEDS,
     VALIDATION_SEEDS,
@@ -82,6 +87,9 @@ def test_train_and_test_seeds_are_apart():
     assert [seed_range(s) for s in (1000, VALIDATION_SEEDS[-1], TRAIN_SEEDS[0])] == ["test", "validation", "training"]
     with pytest.raises(ValueError, match=r"4999999 to 5000000: expected all in one range"):
         seed_range(TEST_SEEDS[-1], 2)
+    kept_apart = [FRESH_SEEDS, SENSES_SEEDS, PLANNER_SEEDS, PLAY_SEEDS]
+    assert all(before.stop <= after.start for before, after in pairwise(kept_apart))
+    assert all(seed_range(seeds.start, len(seeds)) == "validation" for seeds in kept_apart)
     assert not set(generate_levels(5, TEST_SEEDS[:300])) & set(generate_levels(5, TRAIN_SEEDS[:300]))
 
 
