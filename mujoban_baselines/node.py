@@ -13,20 +13,22 @@ from typing import Any, Final, Unpack
 from mujoban_msgs.msg import Episode
 
 from mujoban_core.agent import OWN_SENSES, Agent, AgentInput, beyond_senses
+from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.interfaces import GroundTruth, Module
 from mujoban_core.plugins import AGENT
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.module_node import ModuleNode
-from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
+from mujoban_msgs_py.runtime.tick_node import Output, run_node
+from mujoban_msgs_py.topics import Topic
 
 _SIGHTS: Final = {
-    "frame": Input(topics.CAMERA, conversions.frame_from_msg),
-    "proprio": Input(topics.PROPRIO, conversions.body_proprio_from_msg),
-    "pose": Input(topics.POSE, conversions.pose_from_msg),
-    "top_down": Input(topics.TOP_CAMERA, conversions.frame_from_msg),
-    "abstract_state": Input(topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_from_msg),
+    "frame": topics.CAMERA,
+    "proprio": topics.PROPRIO,
+    "pose": topics.POSE,
+    "top_down": topics.TOP_CAMERA,
+    "abstract_state": topics.TRUE_ABSTRACT_STATE,
 }
 """Where what an agent sees comes from."""
 
@@ -43,7 +45,7 @@ class AgentNode(ModuleNode[Agent]):
     output = topics.TORQUE
 
     @property
-    def inputs(self) -> Sequence[Input]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def inputs(self) -> Sequence[Topic]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What is read in every tick."""
         return [_SIGHTS[name] for name in dict.fromkeys((*OWN_SENSES, *self._sees))]
 
@@ -51,6 +53,13 @@ class AgentNode(ModuleNode[Agent]):
         """Load the agent and start listening."""
         self._sees: tuple[str, ...] = ()
         super().__init__(**options)
+
+    def check(self, topic: Topic, item: Any) -> None:
+        """Refuse also a view from above of another size than agents see."""
+        super().check(topic, item)
+        if topic is topics.TOP_CAMERA and item.shape != (FRAME_SIZE, FRAME_SIZE, 3):
+            said = f"o_top must have shape [{FRAME_SIZE}, {FRAME_SIZE}, 3], got {[*item.shape]}"
+            raise conversions.ConversionError(said)
 
     def prepare(self, module: Module) -> Module:
         """Return the agent, unless it sees something else than the one before."""
@@ -68,7 +77,7 @@ class AgentNode(ModuleNode[Agent]):
 
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
         """Act for one tick."""
-        seen = {name: inputs[_SIGHTS[name].topic.name][None] for name in self._sees}
+        seen = {name: inputs[_SIGHTS[name].name][None] for name in self._sees}
         torque, self.state = self.module.step(AgentInput(**seen), self.state)
         return self.say(episode, conversions.torque_value(torque[0]), conversions.torque_to_msg)
 

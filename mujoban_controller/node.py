@@ -17,19 +17,14 @@ from mujoban_core.interfaces import Controller, ControllerInput, GroundTruth
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.module_node import ModuleNode
-from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
+from mujoban_msgs_py.runtime.tick_node import Output, run_node
 
 
 class ControllerNode(ModuleNode[Controller]):
     """Publishes `/torque`; parameters as in `ModuleNode`."""
 
     role = "controller"
-    inputs = (
-        Input(topics.INSTRUCTION, conversions.instruction_from_msg),
-        Input(topics.CAMERA, conversions.frame_from_msg),
-        Input(topics.PROPRIO, conversions.body_proprio_from_msg),
-        Input(topics.TERMINATION, conversions.termination_from_msg),
-    )
+    inputs = (topics.INSTRUCTION, topics.CAMERA, topics.PROPRIO, topics.TERMINATION)
     output = topics.TORQUE
 
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:

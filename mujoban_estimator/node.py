@@ -16,17 +16,14 @@ from mujoban_core.interfaces import Estimator, EstimatorInput, GroundTruth
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.module_node import ModuleNode
-from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
+from mujoban_msgs_py.runtime.tick_node import Output, run_node
 
 
 class EstimatorNode(ModuleNode[Estimator]):
     """Publishes `/abstract_state`; parameters as in `ModuleNode`."""
 
     role = "estimator"
-    inputs = (
-        Input(topics.CAMERA, conversions.frame_from_msg),
-        Input(topics.POSE, conversions.pose_from_msg),
-    )
+    inputs = (topics.CAMERA, topics.POSE)
     output = topics.ABSTRACT_STATE
 
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:

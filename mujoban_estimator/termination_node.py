@@ -24,7 +24,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.module_node import MOST_TICKS, ModuleNode
-from mujoban_msgs_py.runtime.tick_node import PATIENCE, Input, Output, run_node
+from mujoban_msgs_py.runtime.tick_node import PATIENCE, Output, run_node
 
 REMEMBERED = 64
 """Instructions kept while it is not known which tick they precede: those of other ticks may come in between."""
@@ -47,10 +47,7 @@ class TerminationNode(ModuleNode[Termination]):
     """
 
     role = "termination"
-    inputs = (
-        Input(topics.CAMERA, conversions.frame_from_msg),
-        Input(topics.PROPRIO, conversions.body_proprio_from_msg),
-    )
+    inputs = (topics.CAMERA, topics.PROPRIO)
     output = topics.TERMINATION
 
     def __init__(self, **options: Unpack[NodeOptions]) -> None:

@@ -21,7 +21,7 @@ from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.module_node import ModuleNode
-from mujoban_msgs_py.runtime.tick_node import Input, Output, run_node
+from mujoban_msgs_py.runtime.tick_node import Output, run_node
 from mujoban_planner.deliberation import (
     CERTAINTY,
     MOST_EVALUATIONS,
@@ -48,10 +48,7 @@ class PlannerNode(ModuleNode[Planner]):
     """
 
     role = "planner"
-    inputs = (
-        Input(topics.ABSTRACT_STATE, conversions.abstract_state_from_msg),
-        Input(topics.TERMINATION, conversions.termination_from_msg),
-    )
+    inputs = (topics.ABSTRACT_STATE, topics.TERMINATION)
     output = topics.INSTRUCTION
     truth_inputs = ()
     """A planner, also the oracle, goes by the abstract state that it is given."""

@@ -34,7 +34,7 @@ from mujoban_msgs_py.adapted import Adapted, message_of
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS, Condition
 from mujoban_msgs_py.runtime.kept import KeptArrays, leaves, with_leaves
-from mujoban_msgs_py.runtime.tick_node import Input, Output, TickNode
+from mujoban_msgs_py.runtime.tick_node import Output, TickNode
 from mujoban_msgs_py.topics import Message, Topic
 
 MOST_TICKS = 1_000_000
@@ -46,13 +46,9 @@ AS_IT_ASKS = -1
 _PLACE, _ANSWER, _LEAF = "place", "answer", "state."
 """Keys of what a node keeps: the number of the episode and the stamp of the tick; its answer; arrays of the state."""
 TRUTH_INPUTS = (
-    Input(topics.TRUE_ABSTRACT_STATE, conversions.abstract_state_from_msg),
-    Input(topics.TRUE_POSE, conversions.pose_from_msg),
-    Input(topics.TRUE_TWIST, conversions.twist_from_msg),
-    Input(topics.TRUE_BOXES, conversions.boxes_from_msg),
-    Input(topics.TRUE_TERMINATION, lambda message: conversions.termination_from_msg(message).terminated),
-)
-"""What a privileged module receives besides, in the order of `GroundTruth`."""
+    topics.TRUE_ABSTRACT_STATE, topics.TRUE_POSE, topics.TRUE_TWIST, topics.TRUE_BOXES, topics.TRUE_TERMINATION
+)  # fmt: skip
+"""What a privileged module receives besides."""
 
 
 ModuleT = TypeVar("ModuleT", bound=Module)
@@ -82,9 +78,9 @@ class ModuleNode(TickNode, Generic[ModuleT]):
     """
 
     role: ClassVar[str]
-    inputs: ClassVar[Sequence[Input]]
+    inputs: ClassVar[Sequence[Topic]]
     output: ClassVar[Topic]
-    truth_inputs: ClassVar[Sequence[Input]] = TRUTH_INPUTS
+    truth_inputs: ClassVar[Sequence[Topic]] = TRUTH_INPUTS
 
     def __init__(self, **options: Unpack[NodeOptions]) -> None:
         """Load the module and start listening.
@@ -164,10 +160,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         if self.state is None or episode.episode != self._episode or episode.step == 0:
             self._episode = episode.episode
             self.begin(episode, inputs)
-        truth = None
-        if self._truth:
-            truth = GroundTruth(*(np.asarray(inputs[i.topic.name])[None] for i in self._truth))
-        return self.step(episode, inputs, truth)
+        return self.step(episode, inputs, _ground_truth(inputs) if self._truth else None)
 
     def keep(self, stamp: int, outputs: Sequence[Output]) -> None:
         """Keep the answer and the state for the process that comes after this one."""
@@ -235,6 +228,11 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         self.counts["reloads"] += 1
         self.get_logger().info(f"loaded {weights or 'the weights that ship'} on {device}")
         return SetParametersResult(successful=True)
+
+
+def _ground_truth(inputs: dict[str, Any]) -> GroundTruth:
+    state, pose, twist, boxes, termination = (inputs[topic.name] for topic in TRUTH_INPUTS)
+    return GroundTruth(state[None], pose[None], twist[None], boxes[None], np.array([termination.terminated]))
 
 
 def _serialised(output: Output) -> bytes:

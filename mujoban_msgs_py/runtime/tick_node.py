@@ -34,7 +34,7 @@ from mujoban_core.children import end_with_parent
 from mujoban_core.signals import StopSignal, interruptible
 from mujoban_msgs_py.adapted import Adapted
 from mujoban_msgs_py.arrivals import Arrival
-from mujoban_msgs_py.decoders import checked
+from mujoban_msgs_py.decoders import DECODERS, checked
 from mujoban_msgs_py.listening import belongs, reject, subscribe
 from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
@@ -54,14 +54,6 @@ PATIENCE = 60
 then, and has said it."""
 
 _USAGE = "--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO, as every node of ROS takes them"
-
-
-class Input(NamedTuple):
-    """A topic that a node needs in every tick."""
-
-    topic: Topic
-    decode: Callable[[Any], Any] | None
-    """Turns the message into what the node works with, if given; a ValueError rejects the message."""
 
 
 class Output(NamedTuple):
@@ -126,12 +118,12 @@ class TickNode(GraphNode):
     def check(self, topic: Topic, item: Any) -> None:
         """Raise a ValueError if what a message says, which is sound in itself, is nothing to this node."""
 
-    def open_inputs(self, inputs: Sequence[Input]) -> None:
-        """Subscribe to `/episode` and to what `answer` needs besides."""
-        every = [Input(EPISODE, checked(EPISODE)), *inputs]
-        self._join = Synchroniser([i.topic.name for i in every])
+    def open_inputs(self, inputs: Sequence[Topic]) -> None:
+        """Subscribe to `/episode` and to what `answer` needs besides, each as its topic's reader gives it."""
+        readers = {EPISODE: checked(EPISODE), **{topic: DECODERS[topic] for topic in inputs}}
+        self._join = Synchroniser([topic.name for topic in readers])
         report_on(self, self._condition)
-        for topic, decode in every:
+        for topic, decode in readers.items():
             receive = partial(self._receive, topic, decode)
             # What was said before this node came belongs to ticks that are over; the open one is offered again.
             subscribe(self, topic, receive, live_qos())

@@ -7,7 +7,7 @@ from rclpy.serialization import serialize_message
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.arrivals import Serialised
-from mujoban_msgs_py.runtime.tick_node import PATIENCE, Input, TickNode, run_node
+from mujoban_msgs_py.runtime.tick_node import PATIENCE, TickNode, run_node
 
 
 class Waiting(TickNode):
@@ -16,7 +16,7 @@ class Waiting(TickNode):
     def __init__(self):
         super().__init__("waiting")
         self.answered = []
-        self.open_inputs([Input(topics.POSE, None)])
+        self.open_inputs([topics.POSE])
 
     def answer(self, stamp, episode, inputs, *, insist):
         if not insist:
