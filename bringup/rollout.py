@@ -225,7 +225,7 @@ def tell(
 
     That of robots that are not `looking`, [M], is black.
     """
-    truth = select(world.truth(), rows)
+    truth = world.truth(rows)
     return truth._replace(top_down=_view(world, TOP_DOWN_CAMERA, rows, looking)) if above else truth
 
 

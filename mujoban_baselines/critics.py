@@ -15,7 +15,7 @@ from torch.nn import functional
 from mujoban_baselines.networks import BodySense
 from mujoban_baselines.task import MAX_BOXES
 from mujoban_core.bodies import get_body
-from mujoban_core.grid import CHANNELS, GRID_SIZE
+from mujoban_core.grid import CHANNELS, GRID_SIZE, turn_to_instruction
 
 _WIDTH = 128
 
@@ -108,7 +108,6 @@ class AsymmetricCritic(Critic):
         present = (position.abs() < 2.0 * self._extent).all(-1, keepdim=True).to(position.dtype)
         offset = position - pose[:, None, :2]
         cos, sin = pose[:, 2:].cos(), pose[:, 2:].sin()
-        ahead = offset[..., 0] * cos + offset[..., 1] * sin
-        left = offset[..., 1] * cos - offset[..., 0] * sin
+        ahead, left = turn_to_instruction(offset[..., 0], offset[..., 1], cos, sin)
         parts = [position / self._extent, torch.stack([ahead, left], -1) / self._extent]
         return torch.cat([*(part * present for part in parts), present], -1).flatten(1)

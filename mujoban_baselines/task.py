@@ -6,7 +6,7 @@ Shapes: B robots, K boxes, U actuators.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
 
@@ -15,17 +15,15 @@ import torch
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import get_body
-from mujoban_core.camera import TOP_DOWN_CAMERA
 from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
 from mujoban_core.ranges import check_counts
 from mujoban_rl.engine import State
 from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sim.sights import Sights, observe
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import draw_training_seeds, generate_level
 
-Sights = dict[str, NDArray[Any]]
-"""What is seen, by name, [B, ...] each."""
 Levels = Literal["hard", "curriculum", "easy"]
 LEVELS: Final[dict[str, dict[int, float]]] = {
     "hard": {5: 1.0},
@@ -114,16 +112,6 @@ class TaskConfig:
         return round(self.episode_seconds / CONTROL_PERIOD)
 
 
-_READERS: Final[dict[str, Callable[[World], NDArray[Any]]]] = {
-    "frame": World.render,
-    "top_down": lambda world: world.render(TOP_DOWN_CAMERA),
-    "proprio": lambda world: world.proprio.copy(),
-    "pose": lambda world: world.pose.copy(),
-    "box_position": lambda world: world.box_position.copy(),
-    "abstract_state": World.abstract_state,
-}
-
-
 class MujobanTask(Task):
     """Levels for training, drawn at random, played for the reward of the world."""
 
@@ -149,7 +137,7 @@ class MujobanTask(Task):
 
     def observe(self, names: tuple[str, ...]) -> Sights:
         """Return copies of what is seen now."""
-        return {name: _READERS[name](self.world) for name in names}
+        return observe(self.world, names)
 
     def step(self, torque: NDArray[np.float32]) -> TaskStep:
         """Apply torques for one step."""

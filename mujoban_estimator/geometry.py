@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.camera import FRAME_SIZE, CameraMount, project
-from mujoban_core.grid import GRID_SIZE, cell_to_xy
+from mujoban_core.grid import GRID_SIZE, cell_to_xy, turn_to_instruction
 
 CELLS: Final = GRID_SIZE * GRID_SIZE
 ANCHORS: Final[tuple[tuple[float, float], ...]] = ((0.0, 0.0), (0.0, 0.3), (0.5, 0.25))
@@ -57,8 +57,7 @@ def relative_features(pose: NDArray[np.floating], cell_size: float) -> NDArray[n
     cells = pose[:, :2] / cell_size
     offset = _CENTRES[None] - cells[:, None]
     cos, sin = np.cos(pose[:, 2])[:, None], np.sin(pose[:, 2])[:, None]
-    ahead = offset[..., 0] * cos + offset[..., 1] * sin
-    left = offset[..., 1] * cos - offset[..., 0] * sin
+    ahead, left = turn_to_instruction(offset[..., 0], offset[..., 1], cos, sin)
     distance = np.hypot(ahead, left)
     turn = np.broadcast_to(np.concatenate([cos, sin], axis=1)[:, None], (*distance.shape, 2))
     columns = [

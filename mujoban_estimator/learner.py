@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mujoban_core.grid import OFFSETS_XY
+from mujoban_core.grid import INSTRUCTION_AXES
 from mujoban_core.interfaces import renew_rows
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_estimator.data import Batch, Windows, choose_windows
@@ -26,13 +26,14 @@ from mujoban_estimator.estimator import Belief, EstimatorConfig, StateEstimator
 from mujoban_estimator.evaluate import evaluate
 from mujoban_estimator.losses import Views, estimator_loss, termination_loss
 from mujoban_estimator.odometry import Track
-from mujoban_estimator.termination import ControlTermination, TerminationConfig, true_phases
+from mujoban_estimator.termination import ControlTermination, TerminationConfig
 from mujoban_rl.best import JudgedLearner
 from mujoban_rl.engine import State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, step_if_finite, warm_up_linear
 from mujoban_rl.precision import autocast
 from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.sight.place import phases, phases_along
 from mujoban_rl.weights import WeightsError, load_weights, save_weights, usable_device
 
 _PLACE_OFF: Final = 0.02
@@ -362,10 +363,10 @@ class EstimatorLearner(JudgedLearner[Batch]):
         progress = self.termination.progress(shown, proprio[at], instruction[at], terminated[at], before, needles)
         recurrence = self.termination.initial_recurrence(len(windows.stream))
         output = self.termination(looked, progress.features, proprio[at], *recurrence)
-        direction = self._tensor(OFFSETS_XY[batch.instruction[at]].astype(np.float32))
-        phases = true_phases(self._tensor(batch.pose[at]), direction, self.termination.odometry.body.cell_size)
+        axis = self._tensor(INSTRUCTION_AXES[batch.instruction[at]].astype(np.float32))
+        place = phases(self._tensor(batch.pose[at]), self.termination.odometry.body.cell_size)
         loss, parts = termination_loss(
-            output.logits, output.phases, self._tensor(batch.completed[at]), phases,
+            output.logits, output.phases, self._tensor(batch.completed[at]), phases_along(place, axis),
             self._tensor(windows.valid).float(), place=self.config.place,
         )  # fmt: skip
         return loss, parts, tracks.after()

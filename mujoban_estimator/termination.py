@@ -6,7 +6,6 @@ S values of what is seen in a frame, Z of what the camera says, K of what it sho
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from typing import Final, NamedTuple
 
@@ -21,12 +20,11 @@ from mujoban_core.interfaces import Memory, Termination, TerminationInput, check
 from mujoban_core.ranges import check_counts
 from mujoban_estimator.bearings import BEARINGS, Bearings, Progress, follow
 from mujoban_estimator.encoder import FEATURE_SIZE, FrameEncoder, check_frames
-from mujoban_estimator.odometry import FEATURES, Odometry, Track, turn
+from mujoban_estimator.odometry import FEATURES, Odometry, Track
 from mujoban_rl.compiled import Compilable, bounded_sigmoid
+from mujoban_rl.sight.place import PLACE
 from mujoban_rl.ticks import tick_arrays
 
-PHASES: Final = 4
-"""Cosine and sine of the robot's place within its cell, along and across the instruction."""
 _PRIOR_LOGIT: Final = -3.0
 _PROPRIO_SCALE: Final = 5.0
 
@@ -70,7 +68,7 @@ class Verdicts(NamedTuple):
     logits: Tensor
     """Of p(beta), [B, T]."""
     phases: Tensor
-    """What the camera says of the robot's place within its cell, [B, T, PHASES]; an auxiliary output."""
+    """What the camera says of the robot's place within its cell, [B, T, `PLACE`]; an auxiliary output."""
     hidden: Tensor
     cell: Tensor
 
@@ -97,7 +95,7 @@ class ControlTermination(Compilable, Termination):
         self.see = nn.Linear(seen, c.camera)
         self.turn = nn.Linear(FEATURES, c.camera)
         self.combine = nn.Sequential(nn.ReLU(), nn.Linear(c.camera, c.camera), nn.ReLU())
-        self.phases = nn.Linear(c.camera, PHASES)
+        self.phases = nn.Linear(c.camera, PLACE)
         self.lstm = nn.LSTM(c.camera + features + body.proprio_size, c.hidden, batch_first=True)
         self.verdict = nn.Sequential(nn.Linear(c.hidden, c.hidden), nn.ReLU(), nn.Linear(c.hidden, 1))
         nn.init.constant_(self.verdict[-1].bias, _PRIOR_LOGIT)  # pyright: ignore[reportArgumentType]
@@ -233,16 +231,3 @@ def parts_of(memory: Memory) -> list[Tensor]:
     """Return the parts of a `TerminationMemory` in the order in which `ControlTermination.tick` takes them."""
     hidden, cell, track, needles = memory
     return [hidden, cell, *track, *needles]
-
-
-def true_phases(pose: Tensor, direction: Tensor, cell_size: float) -> Tensor:
-    """Return the label of `Verdicts.phases`, [B, T, PHASES].
-
-    Args:
-        pose: (x [m], y [m], psi [rad]) in the map frame, [B, T, 3].
-        direction: unit vector of the instruction in force, zero for `stay`, [B, T, 2].
-        cell_size: edge of a cell in metres.
-    """
-    # Cell centres lie at half-integers of the map.
-    place = turn(pose[..., :2] / cell_size - 0.5, direction) * (2 * math.pi)
-    return torch.cat([place.cos(), place.sin()], dim=-1)

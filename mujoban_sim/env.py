@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from os import PathLike
 from typing import Any, Final, Literal
 
@@ -16,6 +15,7 @@ from mujoban_core.bodies import Body
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, CONTROL_PERIOD, DIFFICULTIES, GRID_SIZE
 from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sim.sights import observe
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec, LevelSource
 from mujoban_sokoban.generator import draw_training_seeds
@@ -34,16 +34,6 @@ OBSERVATION_SETS: Final[dict[str, tuple[str, ...]]] = {
 """What is observed: as the robot perceives (paper appendix B), all but cameras, or everything."""
 RENDER_SIZE: Final = 256
 """Rows and columns of what `render` returns."""
-
-_READERS: Final[dict[str, Callable[[World], NDArray[Any]]]] = {
-    "frame": World.render,
-    "top_down": lambda world: world.render("top_down"),
-    "proprio": lambda world: world.proprio.copy(),
-    "pose": lambda world: world.pose.copy(),
-    "velocity": lambda world: world.velocity.copy(),
-    "box_position": lambda world: world.box_position.copy(),
-    "abstract_state": World.abstract_state,
-}
 
 
 def observation_space(names: tuple[str, ...], body: Body, max_boxes: int) -> spaces.Dict:
@@ -70,11 +60,6 @@ def observation_space(names: tuple[str, ...], body: Body, max_boxes: int) -> spa
 def draw_seed(generator: np.random.Generator) -> int:
     """Return the seed of an episode for which the user gave none; never one of the test levels'."""
     return draw_training_seeds(generator, 1)[0]
-
-
-def observe(world: World, names: tuple[str, ...]) -> Observations:
-    """Return copies of the named observations of all rows, each [B, ...]."""
-    return {name: _READERS[name](world) for name in names}
 
 
 def check_render_mode(name: str | None) -> None:

@@ -25,9 +25,9 @@ from mujoban_sim.env import (
     check_render_mode,
     draw_seed,
     observation_space,
-    observe,
 )
 from mujoban_sim.presets import DEFAULT_WORLD
+from mujoban_sim.sights import observe
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import LevelSource
 

@@ -354,14 +354,11 @@ class World(Portable):
         """Return a copy of s_abst, binary, [B, N, N, 4]."""
         return self._abstract_state.copy()
 
-    def truth(self) -> GroundTruth:
-        """Return a copy of what only the simulator knows."""
+    def truth(self, rows: NDArray[np.int64] | None = None) -> GroundTruth:
+        """Return a copy of what only the simulator knows, of all rows or of some, [M, ...] each."""
+        m = self._all_rows if rows is None else rows
         return GroundTruth(
-            self.abstract_state(),
-            self.pose.copy(),
-            self.velocity.copy(),
-            self.box_position.copy(),
-            self.completed.copy(),
+            self._abstract_state[m], self.pose[m], self.velocity[m], self.box_position[m], self.completed[m]
         )
 
     def observation(self) -> Observation:
