@@ -105,6 +105,8 @@ _SENSES: Final = ("--learner.slip", "0.015", "--learner.lost", "0.05")
 """How far the odometer is off in training of estimator and termination."""
 _VIEWS: Final = ("--noise", "0.05", "--hidden", "0.1")
 """Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
+_MINED: Final = ("--mined", "0.5")
+"""Of a planner that goes on, half of the levels are such as it lost: of others it wins most, and learns nothing."""
 _LEVELS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
 _VALIDATION_PER_HOUR: Final = 6
@@ -279,7 +281,7 @@ def _planner(options: Options) -> list[Stage]:
     every = max(1, round(_seconds(options, "planner") / _PLANNER_EVALUATIONS))
     command = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.stream))
     command += ("--evaluate-every", str(every))
-    begun = _from_before(options, "--init", "planner")
+    begun = (*_from_before(options, "--init", "planner"), *_MINED) if options.before is not None else ()
     return [
         _trainer(
             options, "planner", (*command, *begun, *_VIEWS), product, sources=_sources(options, "planner"),

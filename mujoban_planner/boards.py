@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
 from mujoban_planner.symmetry import cell_sources
-from mujoban_sokoban.bitboard import SIDE, SQUARES
+from mujoban_sokoban.bitboard import SIDE, SQUARES, pushed
 from mujoban_sokoban.levels import LevelBatch
 
 
@@ -57,6 +57,12 @@ def bit_boards(levels: LevelBatch) -> BitBoards:
     agent = (levels.player[:, 0] - 1) * SIDE + levels.player[:, 1] - 1
     box = pack_boards(_box_layer(levels))
     return BitBoards(pack_boards(levels.wall), pack_boards(levels.target), box, agent.astype(np.uint8))
+
+
+def push_box(boards: BitBoards, row: int, push: int) -> None:
+    """Push a box in one level, in place; the push is possible, 4 * square of the box + direction."""
+    square, direction = divmod(push, 4)
+    boards.box[row], boards.agent[row] = pushed(boards.box[row], square, direction), square
 
 
 def level_batch(boards: BitBoards) -> LevelBatch:

@@ -12,8 +12,9 @@ from typing import Final
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.imitation import ImitationLearner, LearnerConfig
+from mujoban_planner.lesson_store import LessonStore
 from mujoban_planner.samples import Batch
-from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
+from mujoban_planner.search_lessons import SearchActor, SearchConfig
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.run_directory import RunDirectory

@@ -68,7 +68,7 @@ class Trees(NamedTuple):
     heap: NDArray[np.int32]
     """Nodes that wait, the cheapest first, [M, N]."""
     table: NDArray[np.int32]
-    """Open-addressing hash table of states: the node with the fewest moves; -1 for free, [M, power of two]."""
+    """Open-addressing hash table of states, by their nodes; -1 for free, [M, power of two]."""
     nodes: NDArray[np.int64]
     """Number of nodes, [M]."""
     waiting: NDArray[np.int64]
@@ -90,9 +90,18 @@ def region_of(wall: Bits, box: Bits, agent: Int) -> Int:
 
 
 @njit(cache=True, nogil=True)
-def _sift_up(heap: NDArray[np.int32], cost: NDArray[np.float32], size: Int, node: Int) -> None:
-    """Add a node to a heap of `size` nodes."""
-    i = size
+def _place(heap: NDArray[np.int32], node: Int) -> Int:
+    """Return where in a heap a node waits."""
+    i = 0
+    while heap[i] != node:
+        i += 1
+    return i
+
+
+@njit(cache=True, nogil=True)
+def _sift_up(heap: NDArray[np.int32], cost: NDArray[np.float32], place: Int, node: Int) -> None:
+    """Put a node, for which there is room at a place of a heap, where its cost belongs, there or further up."""
+    i = place
     while i > 0:
         above = (i - 1) >> 1
         if cost[heap[above]] <= cost[node]:
@@ -241,25 +250,27 @@ def expand(
             if asked and (after == target or (seen >= 0 and trees.settled[row, seen])):
                 _settle(trees, row, node)
                 break
-            if seen >= 0 and trees.moves[row, seen] <= moves:
-                continue
             if after == target and trees.solution[row] >= 0:
                 continue  # the first solution stands
-            child = _add(trees, row, slot, after, square, region)
-            logp = trees.logp[row, node] + push[i, direction, square] - largest - np.log(total)
+            base = trees.parent[row, trees.branch[row, node]] if asked else 0
             depth = trees.depth[row, node] + 1
-            trees.logp[row, child], trees.moves[row, child], trees.depth[row, child] = logp, moves, depth
-            trees.parent[row, child], trees.push[row, child] = node, 4 * square + direction
+            logp = trees.logp[row, node] + push[i, direction, square] - largest - np.log(total)
+            cost = _cost(trees, row, base, depth, logp) - DEAD_WEIGHT * alive[i]
+            # What was evaluated says the same of its state by any way, and questions ask which way a node came by.
+            if seen >= 0 and (asked or trees.expanded[row, seen] or trees.cost[row, seen] <= cost):
+                continue
+            child = seen if seen >= 0 else _add(trees, row, slot, after, square, region)
+            trees.agent[row, child], trees.parent[row, child] = square, node
+            trees.push[row, child], trees.moves[row, child] = 4 * square + direction, moves
+            trees.depth[row, child], trees.logp[row, child], trees.cost[row, child] = depth, logp, cost
             if after == target:
                 trees.solution[row] = child
                 continue
-            base = 0
             if asked:
                 trees.settled[row, child], trees.branch[row, child] = False, trees.branch[row, node]
-                base = trees.parent[row, trees.branch[row, node]]
-            trees.cost[row, child] = _cost(trees, row, child, base) - DEAD_WEIGHT * alive[i]
-            _sift_up(trees.heap[row], trees.cost[row], trees.waiting[row], child)
-            trees.waiting[row] += 1
+            place = trees.waiting[row] if seen < 0 else _place(trees.heap[row], child)
+            _sift_up(trees.heap[row], trees.cost[row], place, child)
+            trees.waiting[row] += seen < 0
         if asked:
             _forget_settled(trees, row)
 
@@ -284,10 +295,9 @@ def wander(
 
 
 @njit(cache=True, nogil=True)
-def _cost(trees: Trees, row: Int, node: Int, base: Int) -> float:
-    """Return the cost of a node in a search from node `base`, before the verdict on it counts."""
-    depth, logp = trees.depth[row], trees.logp[row]
-    return np.log(depth[node] - depth[base] + 1.0) - (logp[node] - logp[base])
+def _cost(trees: Trees, row: Int, base: Int, depth: Int, logp: float) -> float:
+    """Return the cost of a node so deep and so likely in a search from node `base`, before the verdict on it counts."""
+    return np.log(depth - trees.depth[row, base] + 1.0) - (logp - trees.logp[row, base])
 
 
 @njit(cache=True, nogil=True)
@@ -318,11 +328,13 @@ def question(trees: Trees, rows: NDArray[np.int64]) -> None:
         for node in range(1, nodes):
             if trees.settled[row, node]:
                 continue
-            above = trees.parent[row, node]
-            branch = node if trees.settled[row, above] else trees.branch[row, above]
+            branch = np.int64(node)
+            while not trees.settled[row, trees.parent[row, branch]]:
+                branch = np.int64(trees.parent[row, branch])
             trees.branch[row, node] = branch
             if not trees.expanded[row, node]:
-                trees.cost[row, node] = _cost(trees, row, node, trees.parent[row, branch])
+                base, depth, logp = trees.parent[row, branch], trees.depth[row, node], trees.logp[row, node]
+                trees.cost[row, node] = _cost(trees, row, base, depth, logp)
                 _sift_up(trees.heap[row], trees.cost[row], trees.waiting[row], node)
                 trees.waiting[row] += 1
 

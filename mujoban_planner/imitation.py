@@ -18,6 +18,7 @@ from mujoban_core.ranges import check_counts, check_not_negative, check_positive
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import beginning
+from mujoban_planner.label_choice import LabelChoice
 from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.product import PlannerLearner
@@ -100,7 +101,9 @@ class ImitationConfig(LessonConfig, LearnerConfig):
             raise ValueError(f"--long-moves {self.long_moves}: expected at most {_LONGEST}, as few levels take more")
 
 
-def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> tuple[Tensor, dict[str, Tensor]]:
+def imitation_loss(
+    planner: nn.Module, batch: Batch, config: LearnerConfig, choice: LabelChoice | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the loss and its parts, scalars.
 
     Policy: -log of the probability of all right instructions together. Q: regression of the demonstration's return
@@ -119,8 +122,9 @@ def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> t
     dead = functional.binary_cross_entropy_with_logits(output.dead, batch.dead.float(), weight=known, reduction="sum")
     dead = dead / known.sum().clamp(min=1)
     if output.push_dead is not None:
+        logit = output.push_dead if choice is None else choice(output.push_dead, batch.choice)
         verdicts = functional.binary_cross_entropy_with_logits(
-            output.push_dead, batch.push_dead.float(), weight=batch.push_known.float(), reduction="sum"
+            logit, batch.push_dead.float(), weight=batch.push_known.float(), reduction="sum"
         )
         dead = dead + verdicts / batch.push_known.sum().clamp(min=1)
     q_known = (batch.right | batch.dead).float()
@@ -163,8 +167,10 @@ class ImitationLearner(PlannerLearner[Batch]):
         torch.manual_seed(config.seed)  # the initial weights
         self.network = beginning(config, config.init).to(self.device)
         self._average = moving_average(self.network, config.ema, warm_up=True)
+        self.choice = LabelChoice().to(self.device)
+        groups = [{"params": self.network.parameters()}, {"params": self.choice.parameters(), "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), config.learning_rate, (0.9, 0.98), weight_decay=config.weight_decay, fused=True
+            groups, config.learning_rate, (0.9, 0.98), weight_decay=config.weight_decay, fused=True
         )
         self._schedule = ProgressSchedule(self.optimiser, warm_up_cosine(config.warm_up))
         self._updates = 0
@@ -176,8 +182,8 @@ class ImitationLearner(PlannerLearner[Batch]):
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """The network and its average."""
-        return {"network": self.network, "average": self._average}
+        """The network, its average, and what the choice of labels does."""
+        return {"network": self.network, "average": self._average, "choice": self.choice}
 
     @property
     def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
@@ -199,11 +205,13 @@ class ImitationLearner(PlannerLearner[Batch]):
         self.network.thinking = thoughts[self._updates % len(thoughts)]
         self._updates += 1
         with autocast(self.device):
-            loss, parts = imitation_loss(self.network, batch.to(self.device), self.config)
+            loss, parts = imitation_loss(self.network, batch.to(self.device), self.config, self.choice)
         if guarded_step(loss, [self.optimiser], guard, clip=_CLIP) is not None:
             self._average.update_parameters(self.network)
         rate = self.optimiser.param_groups[0]["lr"]
-        return {f"train/{name}": float(value) for name, value in parts.items()} | {"learning_rate": rate}
+        way, verdict = self.choice.shift.detach()
+        logged = {f"train/{k}": float(v) for k, v in (parts | {"way_shift": way, "verdict_shift": verdict}).items()}
+        return logged | {"learning_rate": rate}
 
     def weights(self) -> Mapping[str, Tensor]:
         """Return the average, whose play is corrected."""

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.ranges import check_counts, check_shares
-from mujoban_planner.boards import BitBoards, bit_boards
+from mujoban_planner.boards import BitBoards, bit_boards, push_box
 from mujoban_planner.seed_streams import LEVELS, first_seed
 from mujoban_planner.shortening import shorten
 from mujoban_rl.engine import State
-from mujoban_sokoban.bitboard import pushed
 from mujoban_sokoban.generator import generate_batch
 from mujoban_sokoban.solver_labels import count_moves
 
@@ -239,6 +238,5 @@ def _boards(tickets: Sequence[Ticket]) -> BitBoards:
             column[rows] = values
     for row, ticket in enumerate(tickets):
         for push in ticket.done:
-            boards.box[row] = pushed(boards.box[row], push // 4, push % 4)
-            boards.agent[row] = push // 4
+            push_box(boards, row, push)
     return boards

@@ -11,11 +11,12 @@ from mujoban_planner import load
 from mujoban_planner.boards import BitBoards, bit_boards, level_batch
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.forest import Forest
+from mujoban_planner.lesson_store import LessonStore
 from mujoban_planner.lessons import errs
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.samples import Samples, concatenate
 from mujoban_planner.search import evaluate_boards, grow
-from mujoban_planner.search_lessons import LessonStore, SearchActor, SearchConfig
+from mujoban_planner.search_lessons import SearchActor, SearchConfig
 from mujoban_planner.teacher import reachable_pushes
 from mujoban_planner.training_levels import LevelConfig, TrainingLevels
 from mujoban_planner.validation import NetworkConfig

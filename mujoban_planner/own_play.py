@@ -1,0 +1,157 @@
+"""What a search is about: a level, where own play of it went wrong, or one push that may be deadly.
+
+Shapes: S states, D = 4 directions, I = 8.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mujoban_planner.boards import BitBoards, state_tensor
+from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.push_env import possible_masks
+from mujoban_rl.precision import autocast
+from mujoban_sokoban.bitboard import SQUARES
+
+_KEPT: Final = 1024
+"""States of own play that wait for an audit, the newest."""
+_LEAST, _MOST = 0.003, 0.7
+"""A push is audited that is called deadly with a probability between these: of others there is hardly a doubt."""
+_UNLIKELY: Final = 0.3
+"""What makes also pushes that are hardly wanted come into an audit."""
+
+Pushed = tuple[int, int, int]
+"""Boxes as a board, square of the robot, and push, 4 * square + direction."""
+
+
+class Phase(StrEnum):
+    """What goes on in a tree."""
+
+    PLAY = "play"
+    """The planner plays by itself."""
+    WON = "won"
+    """It has won: there is nothing to search."""
+    LOST = "lost"
+    """It has lost: a search is to begin."""
+    SEARCH = "search"
+    AUDIT = "audit"
+    """A search asks about the one push before it."""
+
+
+@dataclass
+class Lead:
+    """The planner's own play before a search, and how far it is known to have been right.
+
+    Where a level was lost is found by bisection: a search begins in the middle between the last state that is known to
+    leave a solution and the first that is known to leave none, until these are one push apart.
+    """
+
+    phase: Phase = Phase.WON
+    way: list[Pushed] = field(default_factory=list)
+    """What was pushed, from the level's start on."""
+    root: int = 0
+    """Pushes before the search, or own play's all when it has ended."""
+    alive: int = 0
+    """Pushes before the last state that is known to leave a solution, as the start does."""
+    lost: int = 0
+    """Pushes before the first state that is known to leave none, or, while there is no such, all."""
+    proved: bool = False
+    """Whether that is known of it."""
+
+    @property
+    def values(self) -> list[Any]:
+        """What stands here, as JSON values."""
+        return list(asdict(self).values())
+
+    @classmethod
+    def of(cls, values: Iterable[Any]) -> Lead:
+        """Return a lead from its `values`."""
+        phase, *others = values
+        lead = cls(Phase(phase), *others)
+        lead.way = [(box, agent, push) for box, agent, push in lead.way]
+        return lead
+
+    def learn(self, *, solved: bool, lost: bool) -> list[Pushed]:
+        """Take in what the search from `root` came to; return the pushes that it has shown to be safe."""
+        if solved:
+            before, self.alive = self.alive, self.root
+            return self.way[before : self.root]
+        if lost:
+            self.lost, self.proved = self.root, True
+        else:
+            self.lost, self.proved = self.alive, False  # nobody knows: the search for it is over
+        return []
+
+    @property
+    def fatal(self) -> Pushed | None:
+        """The push that lost the level, once it is found."""
+        return self.way[self.alive] if self.proved and self.lost - self.alive == 1 else None
+
+    @property
+    def middle(self) -> int | None:
+        """Where the next search begins; None where there is nothing more to find."""
+        return (self.alive + self.lost) // 2 if self.lost - self.alive > 1 else None
+
+
+class AuditQueue:
+    """States that won play came through, of which one push each is to be judged by a search.
+
+    What searches prove beside a way is a choice: a solution is found sooner than the proof that there is none. A push
+    that is chosen before anything is known of it tells how often such pushes are deadly.
+    """
+
+    def __init__(self) -> None:
+        """Begin with no state."""
+        self._states: deque[tuple[int, int, int, int]] = deque(maxlen=_KEPT)
+
+    def __len__(self) -> int:
+        """Return the number of states that wait."""
+        return len(self._states)
+
+    def add(self, wall: int, target: int, way: Iterable[Pushed], rng: np.random.Generator) -> None:
+        """Let one of the states of a way wait."""
+        states = list(way)
+        if states:
+            box, agent, _ = states[int(rng.integers(len(states)))]
+            self._states.append((wall, target, box, agent))
+
+    def take(self, count: int) -> BitBoards:
+        """Take the newest states out, at most so many."""
+        taken = [self._states.pop() for _ in range(min(count, len(self._states)))]
+        columns = zip(*taken, strict=True) if taken else ([],) * 4
+        kinds = (np.uint64, np.uint64, np.uint64, np.uint8)
+        return BitBoards._make(np.array([*column], kind) for column, kind in zip(columns, kinds, strict=True))
+
+    @property
+    def values(self) -> list[list[int]]:
+        """What waits, as JSON values."""
+        return [list(state) for state in self._states]
+
+    def restore(self, values: Iterable[Iterable[int]]) -> None:
+        """Take over `values`."""
+        self._states.clear()
+        self._states.extend((wall, target, box, agent) for wall, target, box, agent in values)
+
+
+@torch.inference_mode()
+def draw_doubtful(planner: LearnedPlanner, boards: BitBoards, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return a push of each state, [S], that may be deadly, 4 * square + direction; -1 where there is none.
+
+    Those that the planner wants most are drawn most often. What is drawn depends on what it says alone.
+    """
+    with autocast(planner.device):
+        output, _ = planner.read(state_tensor(boards).to(planner.device))
+    assert output.push_dead is not None  # who asks has verdicts on pushes
+    wanted, dead = (x.float().flatten(1).cpu().numpy() for x in (output.push.exp(), output.push_dead.sigmoid()))
+    doubted = possible_masks(boards) & (dead > _LEAST) & (dead < _MOST)
+    chances = ((_UNLIKELY + wanted) * doubted).cumsum(1, dtype=np.float64)
+    drawn = (chances <= (rng.random(len(chances)) * chances[:, -1])[:, None]).sum(1)
+    return np.where(chances[:, -1] > 0.0, drawn % SQUARES * 4 + drawn // SQUARES, -1)
