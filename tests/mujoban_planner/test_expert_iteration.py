@@ -51,7 +51,8 @@ def judged_pushes(samples: Samples):
 
 
 def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
-    for samples, both in ((lessons["way"], True), (lessons["verdict"], False)):
+    for kind, both, least in (("way", True, 30), ("verdict", False, 30), ("audit", True, 3)):
+        samples = lessons[kind]
         state, direction, square, deadly = judged_pushes(samples)
         one = np.uint64(1)
         box = samples.box[state] ^ (one << square.astype(np.uint64))
@@ -59,7 +60,26 @@ def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
         boards = BitBoards(samples.wall[state], samples.target[state], box, square.astype(np.uint8))
         status = solve_batch(level_batch(boards)).status
         assert (status == np.where(deadly, Status.UNSOLVABLE, Status.SOLVED)).all()
-        assert deadly.sum() > 30 and (not both or (~deadly).sum() > 30)
+        assert deadly.sum() > least and (not both or (~deadly).sum() > least)
+
+
+def test_no_state_is_evaluated_twice_in_a_search():
+    torch.manual_seed(0)
+    forest, rows = Forest(16, 200, 120), np.arange(16)
+    forest.plant(rows, bit_boards(generate_batch(4, range(TRAIN_SEEDS.start, TRAIN_SEEDS.start + 16))))
+    planner = ResidualPlanner(8, 1, judge=True).eval()
+    while (rows := np.flatnonzero(forest.open & (forest.expansions < 200))).size:
+        grow(forest, rows, partial(evaluate_boards, planner))
+    trees, again = forest.trees, 0
+    for row in range(16):
+        nodes = np.flatnonzero(trees.expanded[row, : trees.nodes[row]])
+        states = set(zip(trees.box[row, nodes].tolist(), trees.region[row, nodes].tolist(), strict=True))
+        assert len(states) == len(nodes) == forest.expansions[row]
+        # Some were reached by a likelier way after they had been reached by another: it is theirs then.
+        again += int((trees.parent[row, 1 : trees.nodes[row]] > np.arange(1, trees.nodes[row])).sum())
+        cost = trees.cost[row, trees.heap[row, : trees.waiting[row]]]
+        assert all(cost[(i - 1) // 2] <= cost[i] for i in range(1, len(cost))), "the cheapest first"
+    assert again > 0
 
 
 def test_what_own_play_wins_is_not_searched():

@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+import torch
+
+from mujoban_planner.boards import bit_boards
+from mujoban_planner.label_choice import CHOICES, LabelChoice
+from mujoban_planner.networks import ResidualPlanner
+from mujoban_planner.own_play import AuditQueue, Lead, Phase, draw_doubtful
+from mujoban_planner.teacher import reachable_pushes
+from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
+
+
+@pytest.mark.parametrize("fatal", range(7))
+def test_the_push_that_lost_a_level_is_found_by_few_searches_and_all_before_it_are_safe(fatal):
+    lead = Lead(Phase.LOST, way=[(i, 0, i) for i in range(7)], lost=7, proved=True)
+    safe, searches = [], 0
+    while (root := lead.middle) is not None:
+        lead.root, searches = root, searches + 1
+        safe += lead.learn(solved=root <= fatal, lost=root > fatal)
+    assert lead.fatal == (fatal, 0, fatal) and searches <= 3
+    assert [push for _, _, push in safe] == list(range(fatal))
+
+
+def test_where_a_search_comes_to_nothing_no_push_is_blamed():
+    lead = Lead(Phase.LOST, way=[(i, 0, i) for i in range(8)], lost=8, proved=True)
+    lead.root = lead.middle
+    assert lead.learn(solved=False, lost=False) == [] and lead.middle is None and lead.fatal is None
+
+
+def test_play_that_was_cut_off_blames_no_push_while_all_of_it_leaves_a_solution():
+    lead = Lead(Phase.LOST, way=[(i, 0, i) for i in range(8)], lost=8, proved=False)
+    while (root := lead.middle) is not None:
+        lead.root = root
+        lead.learn(solved=True, lost=False)
+    assert lead.alive == 7 and lead.fatal is None
+
+
+def test_audits_ask_about_pushes_that_are_possible_and_doubted():
+    torch.manual_seed(0)
+    planner = ResidualPlanner(8, 1, judge=True).eval()
+    boards = bit_boards(generate_batch(5, range(TRAIN_SEEDS.start, TRAIN_SEEDS.start + 64)))
+    pushes = draw_doubtful(planner, boards, np.random.default_rng(0))
+    possible = reachable_pushes(boards)[np.arange(64), pushes % 4] >> (pushes // 4).astype(np.uint64) & 1
+    assert len(set(pushes.tolist())) > 20 and possible.all()
+    with torch.no_grad():
+        planner.heads.push_dead[-1].bias.fill_(20.0)  # no doubt: all are deadly
+    assert (draw_doubtful(planner, boards, np.random.default_rng(0)) == -1).all()
+
+
+def test_states_wait_for_an_audit_until_they_are_taken():
+    queue, again = AuditQueue(), AuditQueue()
+    for i in range(3):
+        queue.add(2**63, 2, [(i, i, i)], np.random.default_rng(0))
+    again.restore(queue.values)
+    for waiting in (queue, again):
+        assert waiting.take(2).box.tolist() == [2, 1]
+        last = waiting.take(2)
+        assert last.wall.tolist() == [2**63] and last.agent.dtype == np.uint8 and last.box.tolist() == [0]
+        assert [len(column) for column in waiting.take(2)] == [0, 0, 0, 0]
+
+
+def test_a_choice_of_safe_pushes_is_learned_beside_what_is_said_of_all():
+    generator = torch.Generator().manual_seed(0)
+    n, kind = 4000, torch.tensor([CHOICES["audit"], CHOICES["way"]])
+    dead = torch.rand(2, n, generator=generator) < 0.3
+    known = torch.rand(2, n, generator=generator) < torch.where(dead, torch.tensor([[1.0], [0.05]]), 1.0)
+    choice, logit = LabelChoice(), torch.nn.Parameter(torch.zeros(()))
+    optimiser = torch.optim.Adam([logit, choice.shift], 0.05)
+    for _ in range(300):
+        said = choice(logit.expand(2, 1, 1, n), kind)[:, 0, 0]
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(said, dead.float(), known.float())
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    # Of the true share the standard error is 0.007.
+    share, shift = float(logit.detach().sigmoid()), float(choice.shift[0].detach())
+    assert abs(share - 0.3) < 0.03 and abs(shift - np.log(0.05)) < 0.4
