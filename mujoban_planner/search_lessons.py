@@ -73,7 +73,7 @@ class SearchConfig(LevelConfig, UncertaintyConfig):
     lead: int = 40
     """Pushes of own play at most; where it wins, nothing is searched."""
     audited: float = 0.35
-    """Share of the searches that audit pushes, while own play is won."""
+    """Share of the searches that audit pushes, while levels of difficulty 5 are won."""
     verdicts: int = 6
     """States off the way, of each search, whose proven verdicts are kept."""
     judged: float = 0.4
@@ -307,7 +307,9 @@ class SearchActor(Actor):
         lead.phase = Phase.WON if won else Phase.LOST
         if won:
             self._levels.solved_by(ticket, self._pushes(row))
-            self._audits.add(int(trees.wall[row]), int(trees.target[row]), lead.way, self._rng)
+            # Of levels that are easier there is less to learn, and at first they are all that is won.
+            if ticket.difficulty == max(DIFFICULTIES):
+                self._audits.add(int(trees.wall[row]), int(trees.target[row]), lead.way, self._rng)
         elif self._rng.random() < self.config.led:
             lead.lost, lead.proved = len(lead.way), shut
 
