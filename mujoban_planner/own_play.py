@@ -69,7 +69,7 @@ class Lead:
     @property
     def values(self) -> list[Any]:
         """What stands here, as JSON values."""
-        return list(asdict(self).values())
+        return [*(asdict(self) | {"phase": str(self.phase), "way": [list(push) for push in self.way]}).values()]
 
     @classmethod
     def of(cls, values: Iterable[Any]) -> Lead:

@@ -50,9 +50,17 @@ def judged_pushes(samples: Samples):
     return state, push // 64, push % 64, bits[1][state, push].astype(bool)
 
 
-def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons):
-    for kind, both, least in (("way", True, 30), ("verdict", False, 30), ("audit", True, 3)):
-        samples = lessons[kind]
+@pytest.fixture(scope="module")
+def audits():
+    """What is asked about play of a planner that wins."""
+    actor = SearchActor(NETWORK, replace(SMALL, trees=64), 0, 0)
+    actor.planner = load(compiled=False)
+    delivered = [actor.act().arrays for _ in range(12)]
+    return concatenate([Samples._make(arrays[f"audit.{name}"] for name in Samples._fields) for arrays in delivered])
+
+
+def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons, audits):
+    for samples, both, least in ((lessons["way"], True, 30), (lessons["verdict"], False, 30), (audits, True, 3)):
         state, direction, square, deadly = judged_pushes(samples)
         one = np.uint64(1)
         box = samples.box[state] ^ (one << square.astype(np.uint64))
