@@ -18,7 +18,6 @@ from mujoban_core.ranges import check_counts, check_not_negative, check_positive
 from mujoban_msgs_py.bags.training import bags_digest
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import beginning
-from mujoban_planner.label_choice import LabelChoice
 from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.product import PlannerLearner
@@ -36,6 +35,8 @@ from mujoban_rl.weights import lineage, origin, provenance, usable_device
 
 _CLIP = 1.0
 """Largest norm of the gradient."""
+_CHOSEN = 0.1
+"""Weight of verdicts on pushes whose choice hangs on what they are."""
 _LONGEST = 70
 """Moves that one generated level in a hundred takes, or fewer."""
 
@@ -101,9 +102,7 @@ class ImitationConfig(LessonConfig, LearnerConfig):
             raise ValueError(f"--long-moves {self.long_moves}: expected at most {_LONGEST}, as few levels take more")
 
 
-def imitation_loss(
-    planner: nn.Module, batch: Batch, config: LearnerConfig, choice: LabelChoice | None = None
-) -> tuple[Tensor, dict[str, Tensor]]:
+def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the loss and its parts, scalars.
 
     Policy: -log of the probability of all right instructions together. Q: regression of the demonstration's return
@@ -122,11 +121,7 @@ def imitation_loss(
     dead = functional.binary_cross_entropy_with_logits(output.dead, batch.dead.float(), weight=known, reduction="sum")
     dead = dead / known.sum().clamp(min=1)
     if output.push_dead is not None:
-        logit = output.push_dead if choice is None else choice(output.push_dead, batch.choice)
-        verdicts = functional.binary_cross_entropy_with_logits(
-            logit, batch.push_dead.float(), weight=batch.push_known.float(), reduction="sum"
-        )
-        dead = dead + verdicts / batch.push_known.sum().clamp(min=1)
+        dead = dead + _verdict_loss(output.push_dead, batch)
     q_known = (batch.right | batch.dead).float()
     q_target = torch.where(batch.dead, HOPELESS, batch.value[:, None])
     q = functional.smooth_l1_loss(output.q, q_target, reduction="none")
@@ -142,6 +137,21 @@ def imitation_loss(
     parts = {"policy": policy, "accuracy": accuracy, "push": push, "push_accuracy": best.sum() / n}
     parts |= {"plan": plan, "dead": dead, "dead_recall": caught, "q": q}
     return loss, {k: v.detach() for k, v in parts.items()}
+
+
+def _verdict_loss(logit: Tensor, batch: Batch) -> Tensor:
+    """Return the cross-entropy of verdicts on pushes, [B, D, I, I], where known.
+
+    Those whose choice hangs on what they are say too seldom that a push is deadly: they count little, while there are
+    others.
+    """
+    errors = functional.binary_cross_entropy_with_logits(logit, batch.push_dead.float(), reduction="none")
+    means, counts = [], []
+    for rows in (~batch.chosen, batch.chosen):
+        known = batch.push_known & rows[:, None, None, None]
+        counts.append(known.sum())
+        means.append((errors * known).sum() / counts[-1].clamp(min=1))
+    return means[0] + torch.where(counts[0] > 0, _CHOSEN, 1.0) * means[1]
 
 
 class ImitationLearner(PlannerLearner[Batch]):
@@ -167,10 +177,8 @@ class ImitationLearner(PlannerLearner[Batch]):
         torch.manual_seed(config.seed)  # the initial weights
         self.network = beginning(config, config.init).to(self.device)
         self._average = moving_average(self.network, config.ema, warm_up=True)
-        self.choice = LabelChoice().to(self.device)
-        groups = [{"params": self.network.parameters()}, {"params": self.choice.parameters(), "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(
-            groups, config.learning_rate, (0.9, 0.98), weight_decay=config.weight_decay, fused=True
+            self.network.parameters(), config.learning_rate, (0.9, 0.98), weight_decay=config.weight_decay, fused=True
         )
         self._schedule = ProgressSchedule(self.optimiser, warm_up_cosine(config.warm_up))
         self._updates = 0
@@ -182,8 +190,8 @@ class ImitationLearner(PlannerLearner[Batch]):
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """The network, its average, and what the choice of labels does."""
-        return {"network": self.network, "average": self._average, "choice": self.choice}
+        """The network and its average."""
+        return {"network": self.network, "average": self._average}
 
     @property
     def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
@@ -205,13 +213,11 @@ class ImitationLearner(PlannerLearner[Batch]):
         self.network.thinking = thoughts[self._updates % len(thoughts)]
         self._updates += 1
         with autocast(self.device):
-            loss, parts = imitation_loss(self.network, batch.to(self.device), self.config, self.choice)
+            loss, parts = imitation_loss(self.network, batch.to(self.device), self.config)
         if guarded_step(loss, [self.optimiser], guard, clip=_CLIP) is not None:
             self._average.update_parameters(self.network)
         rate = self.optimiser.param_groups[0]["lr"]
-        way, verdict = self.choice.shift.detach()
-        logged = {f"train/{k}": float(v) for k, v in (parts | {"way_shift": way, "verdict_shift": verdict}).items()}
-        return logged | {"learning_rate": rate}
+        return {f"train/{name}": float(value) for name, value in parts.items()} | {"learning_rate": rate}
 
     def weights(self) -> Mapping[str, Tensor]:
         """Return the average, whose play is corrected."""

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 import torch
 
-from mujoban_planner.label_choice import CHOICES
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch
-from mujoban_planner.search_lessons import SearchConfig
+from mujoban_planner.search_lessons import KINDS, SearchConfig
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.uncertainty import Uncertainty
 from mujoban_rl.actors import Experience
 from mujoban_rl.engine import State
+
+_AUDITS: Final = 0.75
+"""Share of the states that are not on a way in which a push was audited."""
 
 
 class LessonStore:
@@ -20,7 +24,7 @@ class LessonStore:
     def __init__(self, config: SearchConfig, seed: int) -> None:
         """Make room for lessons; `seed` chooses batches."""
         self.config = config
-        self.buffers = {kind: SampleBuffer(config.buffer) for kind in CHOICES}
+        self.buffers = {kind: SampleBuffer(config.buffer) for kind in KINDS}
         self._uncertainty = Uncertainty(config)
         self._rng = np.random.default_rng([seed, 6])
         self._generator = torch.Generator().manual_seed(seed)
@@ -36,15 +40,14 @@ class LessonStore:
         if held["way"] < size:
             return None
         judged = int(size * self.config.judged) if held["verdict"] > size else 0
-        audits = judged // 2 if held["audit"] > size else 0
+        audits = int(judged * _AUDITS) if held["audit"] > size else 0
         counts = {"way": size - judged, "verdict": judged - audits, "audit": audits}
         parts = [self.buffers[kind].draw(count, self._rng) for kind, count in counts.items() if count]
         # What is blurred and hidden are the first and the last of a batch: states of all kinds, hence.
         order = self._rng.permutation(size)
         batch = make_batch(concatenate(parts).take(order), self._rng.integers(0, SYMMETRIES, size))
-        choice = np.repeat([CHOICES[kind] for kind in counts], [*counts.values()])[order]
         state = self._uncertainty.apply(batch.state, self._generator, self._rng)
-        return batch._replace(state=state, choice=torch.from_numpy(choice))
+        return batch._replace(state=state, chosen=torch.from_numpy(order < size - audits))
 
     def state(self) -> State:
         """Return the lessons and the random states."""

@@ -82,8 +82,8 @@ class Batch(NamedTuple):
     """bool [B, 4, I, I]."""
     push_dead: Tensor
     """bool [B, 4, I, I]."""
-    choice: Tensor
-    """How it was chosen which pushes are known, one of `label_choice.CHOICES`, int64 [B]."""
+    chosen: Tensor
+    """Whether what is known of pushes hangs on what it is: a solution is found sooner than a proof; bool [B]."""
 
     def to(self, device: torch.device | str) -> Batch:
         """Return the batch on a device."""
@@ -165,7 +165,7 @@ def make_batch(samples: Samples, symmetry: NDArray[np.int64]) -> Batch:
         torch.from_numpy(_next_pushes(samples.next_push, symmetry)),
         _push_planes(samples.push_known, symmetry),
         _push_planes(samples.push_dead, symmetry),
-        torch.zeros(n, dtype=torch.int64),
+        torch.zeros(n, dtype=torch.bool),
     )
 
 

@@ -28,7 +28,6 @@ from mujoban_core.ranges import check_counts, check_shares
 from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import BitBoards, push_box
 from mujoban_planner.forest import Forest, Verdicts
-from mujoban_planner.label_choice import CHOICES
 from mujoban_planner.lessons import errs
 from mujoban_planner.own_play import AuditQueue, Lead, Phase, draw_doubtful
 from mujoban_planner.samples import Samples, concatenate, unlabelled
@@ -43,6 +42,8 @@ from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
 from mujoban_rl.precision import autocast
 
+KINDS: Final = ("way", "verdict", "audit")
+"""Of samples: on ways that were found; off them, with what was proved there; pushes that were audited."""
 _LONG: Final = 15
 """Expansions from which on a search may have proved something that is not seen at once."""
 _NONE: Final = np.zeros(0, np.uint64)
@@ -72,7 +73,7 @@ class SearchConfig(LevelConfig, UncertaintyConfig):
     start."""
     lead: int = 40
     """Pushes of own play at most; where it wins, nothing is searched."""
-    audited: float = 0.35
+    audited: float = 0.5
     """Share of the searches that audit pushes, while levels of difficulty 5 are won."""
     verdicts: int = 6
     """States off the way, of each search, whose proven verdicts are kept."""
@@ -96,7 +97,7 @@ class SearchConfig(LevelConfig, UncertaintyConfig):
 
 
 Lessons = dict[str, list[Samples]]
-"""Samples of each kind: on ways that were found; off them, with what was proved there; pushes that were audited."""
+"""Samples of each of `KINDS`."""
 Ended = dict[str, list[bool]]
 """How plays and searches ended, by what they were."""
 
@@ -104,7 +105,7 @@ Ended = dict[str, list[bool]]
 class SearchActor(Actor):
     """Searches all the time; delivers what searches that ended have found and proved. A step is a network evaluation.
 
-    Delivered are the columns of `Samples` of each of `label_choice.CHOICES`, under its name and a dot.
+    Delivered are the columns of `Samples` of each of `KINDS`, under its name and a dot.
     """
 
     def __init__(
@@ -141,7 +142,7 @@ class SearchActor(Actor):
 
     def act(self) -> Experience:
         """Let every search take so many steps."""
-        lessons: Lessons = {kind: [unlabelled(_NO_BOARDS)] for kind in CHOICES}
+        lessons: Lessons = {kind: [unlabelled(_NO_BOARDS)] for kind in KINDS}
         ended: Ended = {f"{kind}/{d}": [] for kind in ("play", "search") for d in DIFFICULTIES}
         ended |= {"play/mined": [], "play/long": [], "audit/decided": [], "audit/dead": []}
         for _ in range(self.config.steps):
@@ -265,6 +266,9 @@ class SearchActor(Actor):
         searching = forest.trees.solution < 0
         grow(forest, np.arange(self.config.trees), self._evaluate)
         solved = np.flatnonzero(searching & (forest.trees.solution >= 0))
+        asked = np.array([lead.phase is Phase.AUDIT for lead in self._leads])
+        self._budgets[asked & (forest.trees.solution >= 0)] = 0  # that was all
+        solved = solved[~asked[solved]]
         forest.question(solved)
         self._budgets[solved] = forest.expansions[solved] + self.config.questions
 

@@ -1,9 +1,11 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from mujoban_planner.boards import bit_boards
-from mujoban_planner.label_choice import CHOICES, LabelChoice
+from mujoban_planner.imitation import _verdict_loss
 from mujoban_planner.networks import ResidualPlanner
 from mujoban_planner.own_play import AuditQueue, Lead, Phase, draw_doubtful
 from mujoban_planner.teacher import reachable_pushes
@@ -59,19 +61,16 @@ def test_states_wait_for_an_audit_until_they_are_taken():
         assert [len(column) for column in waiting.take(2)] == [0, 0, 0, 0]
 
 
-def test_a_choice_of_safe_pushes_is_learned_beside_what_is_said_of_all():
-    generator = torch.Generator().manual_seed(0)
-    n, kind = 4000, torch.tensor([CHOICES["audit"], CHOICES["way"]])
-    dead = torch.rand(2, n, generator=generator) < 0.3
-    known = torch.rand(2, n, generator=generator) < torch.where(dead, torch.tensor([[1.0], [0.05]]), 1.0)
-    choice, logit = LabelChoice(), torch.nn.Parameter(torch.zeros(()))
-    optimiser = torch.optim.Adam([logit, choice.shift], 0.05)
-    for _ in range(300):
-        said = choice(logit.expand(2, 1, 1, n), kind)[:, 0, 0]
-        loss = torch.nn.functional.binary_cross_entropy_with_logits(said, dead.float(), known.float())
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    # Of the true share the standard error is 0.007.
-    share, shift = float(logit.detach().sigmoid()), float(choice.shift[0].detach())
-    assert abs(share - 0.3) < 0.03 and abs(shift - np.log(0.05)) < 0.4
+def test_verdicts_follow_audits_and_not_those_that_were_chosen_by_what_they_are():
+    logit = torch.zeros(4, 4, 8, 8, requires_grad=True)
+    known = torch.zeros(4, 4, 8, 8, dtype=torch.bool)
+    known[:, 0, 0, 0] = True
+    dead = known & torch.tensor([True, False, False, False])[:, None, None, None]
+    batch = SimpleNamespace(push_known=known, push_dead=dead, chosen=torch.tensor([False, False, True, True]))
+    shares = []
+    for chosen in (batch.chosen, torch.ones(4, dtype=torch.bool)):
+        batch.chosen = chosen
+        (gradient,) = torch.autograd.grad(_verdict_loss(logit, batch), logit)
+        shares.append(gradient[:, 0, 0, 0].tolist())
+    assert shares[0] == pytest.approx([-0.25, 0.25, 0.025, 0.025]), "little, while there are audits"
+    assert shares[1] == pytest.approx([-0.125, 0.125, 0.125, 0.125])
