@@ -163,6 +163,8 @@ class Trainer(Generic[BatchT]):
         self.metrics: dict[str, float] = {}
         """Of the last evaluation."""
         self._record = dict(record or {})
+        self._told: dict[str, Any] | None = None
+        """The record that the checkpoint was saved with; a light copy has none."""
         self._guard = NaNGuard()
         self._published: dict[str, Tensor] | None = None
         self._version = 0
@@ -190,6 +192,8 @@ class Trainer(Generic[BatchT]):
     ) -> bool:
         """Train until the budget or a limit is spent, the source has no more, or a signal comes; then save.
 
+        Where nothing is left to do, the weights are written once more, with the record that they had.
+
         Args:
             limit_seconds: Wall-clock seconds of this bit of the run.
             limit_samples: Samples of the whole run after which this bit ends; schedules follow the budget.
@@ -214,10 +218,14 @@ class Trainer(Generic[BatchT]):
                 TrainingLog(self.directory, total=total, initial=self.progress.samples, unit="sample") as log,
                 StopSignal() as stop,
             ):
+                idle = self.complete and self.judged
                 spent = self._loop(log, stop, limits)
-                if not stop.requested and self._evaluated != self.progress.updates:
-                    self._evaluate(log, stop)
-                self.save()
+                if idle:
+                    self.learner.export(self.directory, self._told or self._told_now())
+                else:
+                    if not stop.requested and self._evaluated != self.progress.updates:
+                        self._evaluate(log, stop)
+                    self.save()
             if stop.requested:
                 done = f"{readable(self.progress.samples)} samples"
                 say(f"{self.directory.path}: interrupted after {done}; the same command goes on from there")
@@ -311,6 +319,7 @@ class Trainer(Generic[BatchT]):
         parts = {"learner": self.learner, "source": self.source}
         published = State({"version": self._version}, self._published or {})
         state = State.of({name: part.state() for name, part in parts.items()} | {"published": published})
+        record = self._told_now()
         self.directory.save(
             self.progress.updates,
             modules={f"{name}.{k}": v for name, part in parts.items() for k, v in part.modules.items()},
@@ -319,14 +328,19 @@ class Trainer(Generic[BatchT]):
                 "progress": vars(self.progress),
                 "metrics": self.metrics,
                 "skipped": self._guard.skipped,
-                "due": self._due,
+                # What is complete is judged once more, also if the process is killed meanwhile.
+                "due": self._due or (self.complete and self._evaluated != self.progress.updates),
+                "record": record,
                 "began": self.source.began,
                 **state.values,
             },
             tensors=state.tensors,
         )
-        record = {**self._record, **vars(self.progress), "metrics": self.metrics}
         self.learner.export(self.directory, record)
+
+    def _told_now(self) -> dict[str, Any]:
+        """Return what the record of the weights says now."""
+        return {**self._record, **vars(self.progress), "metrics": self.metrics}
 
     def _restore(self) -> None:
         parts = {"learner": self.learner, "source": self.source}
@@ -336,6 +350,7 @@ class Trainer(Generic[BatchT]):
         )
         if snapshot is None:
             return
+        self._told = snapshot.extra.get("record")
         with self.directory.reading(snapshot.step):
             self.progress = Progress(**snapshot.extra["progress"])
             self.metrics = snapshot.extra["metrics"]

@@ -58,6 +58,9 @@ class Regression(Learner[torch.Tensor]):
     def evaluate(self):
         return {"weight": float(self.net.weight.detach().abs().sum())}
 
+    def export(self, directory, record):
+        (directory.path / "record.json").write_text(json.dumps(record))
+
 
 class Noise(Source[torch.Tensor]):
     def __init__(self, poison=(), on_batch=None, end=None):
@@ -89,8 +92,9 @@ class Noise(Source[torch.Tensor]):
         self.closed = True
 
 
-def trainer(path, source=None, samples=200, cadence=CADENCE):
-    return Trainer(RunDirectory(path, {}), Regression(), source or Noise(), Budget(samples=samples), cadence)
+def trainer(path, source=None, samples=200, cadence=CADENCE, **record):
+    learner, budget = Regression(), Budget(samples=samples)
+    return Trainer(RunDirectory(path, {}), learner, source or Noise(), budget, cadence, record=record)
 
 
 def weights(run):
@@ -208,6 +212,33 @@ def test_schedules_follow_the_budget_and_a_spent_budget_trains_no_more(tmp_path)
     before = weights(run)
     again = trainer(tmp_path, samples=80)
     assert again.run() and same(before, weights(again))
+
+
+def test_what_a_complete_run_has_made_keeps_its_record_whoever_calls_it_again(tmp_path):
+    made = tmp_path / "record.json"
+    trainer(tmp_path, commit="first").run()
+    record, checkpoints = made.read_bytes(), sorted(tmp_path.glob("checkpoint-*"))
+    written = [file.stat().st_mtime_ns for file in checkpoints]
+    again = trainer(tmp_path, commit="second")
+    again.learner.evaluate = lambda: pytest.fail("judged once more")
+    assert again.run() and made.read_bytes() == record
+    assert [file.stat().st_mtime_ns for file in checkpoints] == written
+    # What is lost comes back.
+    made.unlink()
+    assert trainer(tmp_path, commit="second").run() and made.read_bytes() == record
+
+
+def test_a_run_killed_while_it_is_judged_at_its_end_is_judged_when_it_is_called_again(tmp_path):
+    def learn():
+        run = trainer(tmp_path, samples=8, cadence=replace(CADENCE, save_seconds=0.0))
+        run.learner.evaluate = lambda: os.kill(os.getpid(), signal.SIGKILL)
+        run.run()
+
+    process = get_context("fork").Process(target=learn)
+    process.start()
+    process.join()
+    run = trainer(tmp_path, samples=8)
+    assert run.complete and run.run() and run.metrics
 
 
 def test_after_a_stop_actors_go_on_with_the_weights_that_they_had(tmp_path):
