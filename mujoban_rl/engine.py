@@ -32,7 +32,7 @@ from mujoban_core.text import readable
 from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.memory import keep_freed_memory
 from mujoban_rl.progress import Budget, Cadence, Clock, Meter, Progress
-from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.run_directory import RunDirectory, RunError
 from mujoban_rl.state import State
 from mujoban_rl.training_log import TrainingLog
 
@@ -129,6 +129,8 @@ CARRIED: Final = (
     "progress", "metrics", "skipped", "due", "learner.best", "source.pool.next_stream", "source.pool.pool.next_stream",
 )  # fmt: skip
 """What a light copy of a checkpoint holds beside its modules (see `mujoban_rl.run_directory.copy_light`)."""
+_BAGS: Final = "bags_digest"
+"""By what a record knows the bags again, wherever they lie; a light copy, which leaves them behind, may have others."""
 
 
 class Trainer(Generic[BatchT]):
@@ -155,7 +157,8 @@ class Trainer(Generic[BatchT]):
             record: What the weights' record says beside progress and metrics (see `mujoban_rl.weights.provenance`).
 
         Raises:
-            RunError: If there are checkpoints but none is intact, or they are of another kind of run.
+            RunError: If there are checkpoints but none is intact, or they are of another kind of run, or learned from
+                other bags than those of `record`.
         """
         self.directory, self.learner, self.source = directory, learner, source
         self.budget, self.cadence = budget, cadence or Cadence()
@@ -342,6 +345,16 @@ class Trainer(Generic[BatchT]):
         """Return what the record of the weights says now."""
         return {**self._record, **vars(self.progress), "metrics": self.metrics}
 
+    def _take_over(self, record: Mapping[str, Any] | None) -> None:
+        """Take over the record of a checkpoint, if it has one: it must be of the same bags."""
+        self._told = None if record is None else dict(record)
+        now = self._record.get(_BAGS)
+        if record is not None and (then := record.get(_BAGS, now)) != now:
+            raise RunError(
+                f"{self.directory.path}: other bags than the run's (digest {then or 'none'} there, {now or 'none'} "
+                "now): expected those, or another --run"
+            )
+
     def _restore(self) -> None:
         parts = {"learner": self.learner, "source": self.source}
         snapshot = self.directory.load(
@@ -350,7 +363,7 @@ class Trainer(Generic[BatchT]):
         )
         if snapshot is None:
             return
-        self._told = snapshot.extra.get("record")
+        self._take_over(snapshot.extra.get("record"))
         with self.directory.reading(snapshot.step):
             self.progress = Progress(**snapshot.extra["progress"])
             self.metrics = snapshot.extra["metrics"]

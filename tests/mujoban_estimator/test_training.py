@@ -29,7 +29,8 @@ from mujoban_estimator.train import Options, main, make_trainer
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import BagError
 from mujoban_msgs_py.bags.training import find_bags, open_training_bag
-from mujoban_rl.run_directory import RunError
+from mujoban_rl.engine import CARRIED
+from mujoban_rl.run_directory import RunError, copy_light
 from mujoban_rl.testing import check_refusal, check_resuming
 from mujoban_rl.weights import WeightsError
 
@@ -118,13 +119,22 @@ def test_a_batch_with_nan_leaves_both_modules_their_memory_and_the_optimiser_unt
     check_refusal(make(tmp_path), poisoned)
 
 
-def test_the_next_bit_of_a_run_begins_other_bags_anew_also_of_the_same_names(bags, make, tmp_path):
+def test_a_run_knows_moved_bags_again_and_refuses_others_also_of_the_same_names(bags, make, tmp_path):
     (first,) = find_bags([bags])
     make(tmp_path / "run").run(limit_updates=1)
     moved = tmp_path / "moved" / first.name
     shutil.copytree(first, moved)
     other = tmp_path / "other" / first.name
     copy_without(open_training_bag(first, TOPICS), other, lambda _, stamp: stamp == 6 * topics.TICK)
+    with pytest.raises(RunError, match=r"run: other bags than the run's \(digest \w{64} there, \w{64} now\)"):
+        make(tmp_path / "run", bags=tmp_path / "other")
+    # One that was carried elsewhere without its bags begins others anew, and so does one of before these were noted.
+    copy_light(tmp_path / "run", tmp_path / "light", CARRIED)
+    make(tmp_path / "light", bags=tmp_path / "other").run(limit_updates=2)
+    for checkpoint in (tmp_path / "run").glob("checkpoint-*.json"):
+        content = json.loads(checkpoint.read_text())
+        del content["extra"]["record"]
+        checkpoint.write_text(json.dumps(content))
     begins = {}
     for name in ("moved", "other"):
         source = make(tmp_path / "run", bags=tmp_path / name).source

@@ -241,6 +241,28 @@ def test_a_run_killed_while_it_is_judged_at_its_end_is_judged_when_it_is_called_
     assert run.complete and run.run() and run.metrics
 
 
+def test_a_run_that_goes_on_with_other_bags_is_refused_unless_it_was_carried_without_them(tmp_path):
+    def run(name, bags):
+        return trainer(tmp_path / name, bags_digest=bags)
+
+    run("run", "one").run(limit_updates=2)
+    run("run", "one").run(limit_updates=3)
+    for others in ("two", None):
+        told = rf"run: other bags than the run's \(digest one there, {others or 'none'} now\): expected those, or"
+        with pytest.raises(RunError, match=told):
+            run("run", others)
+    copy_light(tmp_path / "run", tmp_path / "light", CARRIED)
+    run("light", "two").run(limit_updates=4)
+    with pytest.raises(RunError, match="digest two there, one now"):
+        run("light", "one")
+    # A run of before there was this check is taken at its word.
+    for file in (tmp_path / "run").glob("checkpoint-*.json"):
+        content = json.loads(file.read_text())
+        del content["extra"]["record"]
+        file.write_text(json.dumps(content))
+    assert run("run", "two").progress.updates == 3
+
+
 def test_after_a_stop_actors_go_on_with_the_weights_that_they_had(tmp_path):
     class Acting(Noise):
         def publish(self, weights, version):
