@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
 from torch import Tensor, nn
@@ -29,7 +28,7 @@ from mujoban_core.files import alone
 from mujoban_core.program import say
 from mujoban_core.signals import Interrupted, StopSignal
 from mujoban_core.text import readable
-from mujoban_rl.limits import NaNGuard, TimeLimit
+from mujoban_rl.limits import Limits, NaNGuard, TimeLimit
 from mujoban_rl.memory import keep_freed_memory
 from mujoban_rl.progress import Budget, Cadence, Clock, Meter, Progress
 from mujoban_rl.run_directory import RunDirectory, RunError
@@ -214,7 +213,7 @@ class Trainer(Generic[BatchT]):
         keep_freed_memory()
         samples = min(self.budget.samples, limit_samples)
         total = None if math.isinf(samples) else int(samples)
-        limits = _Limits(TimeLimit(limit_seconds), limit_samples, limit_updates)
+        limits = Limits(TimeLimit(limit_seconds), limit_samples, limit_updates)
         try:
             with (
                 alone(self.directory.path),
@@ -238,7 +237,7 @@ class Trainer(Generic[BatchT]):
             self.source.close()
         return spent
 
-    def _loop(self, log: TrainingLog, stop: StopSignal, limits: _Limits) -> bool:
+    def _loop(self, log: TrainingLog, stop: StopSignal, limits: Limits) -> bool:
         """Train; return whether it ended because nothing is left to do."""
         cadence, progress, source = self.cadence, self.progress, self.source
         clock, meter = Clock(progress, source.worker_cpu_seconds), Meter()
@@ -382,16 +381,3 @@ class Trainer(Generic[BatchT]):
                 self._published, self._version = published.tensors, published.values["version"]
         self.source.samples = self.progress.samples
         self.source.began = self.progress.samples if snapshot.light else snapshot.extra.get("began", 0)
-
-
-@dataclass(frozen=True)
-class _Limits:
-    """What ends one bit of a run."""
-
-    time: TimeLimit
-    samples: float
-    updates: float
-
-    def reached(self, progress: Progress) -> bool:
-        """Return whether one of the limits is reached."""
-        return self.time.reached or progress.samples >= self.samples or progress.updates >= self.updates

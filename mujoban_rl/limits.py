@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from mujoban_rl.progress import Progress
 
 
 class NaNGuard:
@@ -63,3 +66,16 @@ class TimeLimit:
     def reached(self) -> bool:
         """Whether the time is up."""
         return self.elapsed >= self._seconds
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What ends one bit of a run."""
+
+    time: TimeLimit
+    samples: float
+    updates: float
+
+    def reached(self, progress: Progress) -> bool:
+        """Return whether one of the limits is reached."""
+        return self.time.reached or progress.samples >= self.samples or progress.updates >= self.updates
