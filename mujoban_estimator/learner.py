@@ -72,8 +72,7 @@ class LearnerConfig:
     def __post_init__(self) -> None:
         """Reject configurations that contradict themselves."""
         shared = ("body", "stem", "channels", "blocks")
-        differing = [n for n in shared if getattr(self.estimator, n) != getattr(self.termination, n)]
-        if differing:
+        if differing := [n for n in shared if getattr(self.estimator, n) != getattr(self.termination, n)]:
             raise ValueError(f"estimator and termination differ in {', '.join(differing)}: expected one shared ResNet")
         check_counts(self, "window_frames", "window_length")
         check_not_negative(self, "unseen", "frame", "place", "bearings", "cells", "slip")
@@ -171,13 +170,10 @@ class EstimatorLearner(JudgedLearner[Batch]):
         torch.manual_seed(config.seed)  # the initial weights
         self.estimator = StateEstimator(**vars(self.config.estimator)).to(self.device)
         self.termination = ControlTermination(self.estimator.encoder, **vars(self.config.termination)).to(self.device)
-        both = {id(p): p for module in self.modules.values() for p in module.parameters()}
-        self._parameters = list(both.values())
+        self._parameters = list({id(p): p for module in self.modules.values() for p in module.parameters()}.values())
         self.optimiser = torch.optim.Adam(self._parameters, config.learning_rate, fused=True)
         self._schedule = ProgressSchedule(self.optimiser, warm_up_linear(config.warm_up, config.final_rate))
-        self._threads = ThreadPoolExecutor(
-            config.shards, "shard", torch.set_num_threads, (torch.get_num_threads(),)
-        )  # fmt: skip
+        self._threads = ThreadPoolExecutor(config.shards, "shard", torch.set_num_threads, (torch.get_num_threads(),))
         self._validation, self._skip_damaged, self._out = list(validation), skip_damaged, out
         self._belief = self.estimator.initial_belief(config.streams)
         self._track = self._lost_track(config.streams)
@@ -253,9 +249,13 @@ class EstimatorLearner(JudgedLearner[Batch]):
         self.best.judge(self._both, tuple(rates.get(name, 0.0) for name in JUDGED_BY), rates)
         return rates
 
+    def folder(self, directory: RunDirectory) -> Path:
+        """Return where the weights of both modules go."""
+        return self._out or directory.path / "weights"
+
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
         """Write the weights of the best two modules, or of the present ones where none were judged."""
-        out = self._out or directory.path / "weights"
+        out = self.folder(directory)
         best, told = self.best.chosen(self._both), {**record, **self.best.told}
         for name, module in (("estimator", self.estimator), ("termination", self.termination)):
             save_weights(out / f"{name}.safetensors", best[name], module.hyperparameters(), told)

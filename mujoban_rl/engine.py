@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
 from torch import Tensor, nn
@@ -90,8 +91,12 @@ class Learner(_Part, Generic[BatchT]):
     def restore_best(self, state: State) -> None:
         """Take over the part `best` of what `state` returned: all that a light copy keeps of it."""
 
+    def folder(self, directory: RunDirectory) -> Path:
+        """Return where `export` writes; by default the run's directory."""
+        return directory.path
+
     def export(self, directory: RunDirectory, record: Mapping[str, Any]) -> None:
-        """Write the weights that the run is for, with their record, into the run's directory."""
+        """Write the weights that the run is for, with their record, into `folder`."""
 
 
 class Source(_Part, Generic[BatchT]):
@@ -128,6 +133,7 @@ CARRIED: Final = (
     "progress", "metrics", "skipped", "due", "learner.best", "source.pool.next_stream", "source.pool.pool.next_stream",
 )  # fmt: skip
 """What a light copy of a checkpoint holds beside its modules (see `mujoban_rl.run_directory.copy_light`)."""
+_GOES_ON: Final = "; the same command goes on from there"
 _BAGS: Final = "bags_digest"
 """By what a record knows the bags again, wherever they lie; a light copy, which leaves them behind, may have others."""
 
@@ -228,11 +234,15 @@ class Trainer(Generic[BatchT]):
                     if not stop.requested and self._evaluated != self.progress.updates:
                         self._evaluate(log, stop)
                     self.save()
+            path, done = self.directory.path, f"after {readable(self.progress.samples)} samples"
             if stop.requested:
-                done = f"{readable(self.progress.samples)} samples"
-                say(f"{self.directory.path}: interrupted after {done}; the same command goes on from there")
+                say(f"{path}: interrupted {done}{_GOES_ON}")
                 # Whoever waits for the command, such as make, is not to take what is half trained for done.
                 stop.check()
+            if not idle and spent:
+                say(f"{path}: complete {done}: weights in {self.learner.folder(self.directory)}")
+            elif not spent:
+                say(f"{path}: stopped {done}{_GOES_ON if limits.time.reached else ''}")
         finally:
             self.source.close()
         return spent

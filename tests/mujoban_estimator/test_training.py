@@ -75,8 +75,12 @@ def test_a_device_that_is_not_there_is_named(bags, tmp_path):
         make_trainer(Options((bags,), tmp_path, device="tpu"))
 
 
-def test_weights_are_in_the_folder_of_the_run_unless_it_is_said_where(make, tmp_path):
+def test_weights_are_in_the_folder_of_the_run_unless_it_is_said_where(bags, make, tmp_path, capsys):
     make(tmp_path).save()
+    config = TrainConfig(LearnerConfig(*SMALL), streams=1, length=4, steps=1)
+    options = Options((bags,), tmp_path / "other", out=tmp_path / "out", config=config, workers=0)
+    make_trainer(options).run()
+    assert f"other: complete after 4 samples: weights in {tmp_path / 'out'}\n" in capsys.readouterr().err
     assert load(tmp_path / "weights" / "estimator.safetensors").config.channels == 8
 
 

@@ -197,6 +197,17 @@ def test_learning_curve_evaluations_and_published_versions_follow_the_cadence(tm
     assert all("cpu_seconds" in line for line in lines)
 
 
+def test_a_run_that_ends_says_how_and_where_its_weights_are(tmp_path, capsys):
+    def said(**limits):
+        trainer(tmp_path / "run").run(**limits)
+        return capsys.readouterr().err.splitlines()[-1]
+
+    assert said(limit_seconds=0.0).endswith("run: stopped after 0 samples; the same command goes on from there")
+    assert said(limit_updates=2).endswith("run: stopped after 8 samples")
+    assert said().endswith(f"run: complete after 200 samples: weights in {tmp_path / 'run'}")
+    assert said().endswith("run: complete after 200 samples; nothing is left to do")
+
+
 def test_what_came_since_the_last_line_is_logged_where_a_bit_ends(tmp_path):
     cadence = Cadence(log_updates=5)
     for updates in (7, 10):
