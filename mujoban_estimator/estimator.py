@@ -44,7 +44,8 @@ class EstimatorConfig:
     """Ticks from one update of the belief to the next; in between the estimate is held."""
 
     def __post_init__(self) -> None:
-        """Reject sizes that are not positive."""
+        """Reject bodies that are unknown and sizes that are not positive."""
+        get_body(self.body)
         check_counts(self, "stem", "channels", "blocks", "embedding", "belief", "update_every")
 
 

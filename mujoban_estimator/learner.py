@@ -72,8 +72,8 @@ class LearnerConfig:
     def __post_init__(self) -> None:
         """Reject configurations that contradict themselves."""
         shared = ("body", "stem", "channels", "blocks")
-        if differing := [n for n in shared if getattr(self.estimator, n) != getattr(self.termination, n)]:
-            raise ValueError(f"estimator and termination differ in {', '.join(differing)}: expected one shared ResNet")
+        if names := ", ".join(n for n in shared if getattr(self.estimator, n) != getattr(self.termination, n)):
+            raise ValueError(f"--learner.estimator and --learner.termination differ in {names}: expected one ResNet")
         check_counts(self, "window_frames", "window_length")
         check_not_negative(self, "unseen", "frame", "place", "bearings", "cells", "slip")
         check_shares(self, "lost")

@@ -46,6 +46,7 @@ class TerminationConfig:
 
     def __post_init__(self) -> None:
         """Reject what is out of range."""
+        get_body(self.body)
         check_counts(self, "stem", "channels", "blocks", "camera", "hidden")
         check_termination(limit=self.limit, threshold=self.threshold)
 

@@ -71,6 +71,8 @@ def test_an_episode_that_begins_in_a_refused_batch_does_not_go_on_with_the_memor
 def test_estimator_and_termination_must_share_the_resnet():
     with pytest.raises(ValueError, match="channels"):
         LearnerConfig(termination=TerminationConfig(channels=8))
+    with pytest.raises(ValueError, match=r"--learner\.estimator and --learner\.termination differ in body: expected"):
+        LearnerConfig(termination=TerminationConfig(body="ant"))
     learner = EstimatorLearner(TrainConfig())
     assert learner.estimator.encoder is learner.termination.encoder
 

@@ -59,6 +59,13 @@ def test_the_command_names_a_bad_bag_in_one_line(tmp_path, capsys):
     assert said.count("\n") == 1 and "no bag in" in said
 
 
+@pytest.mark.parametrize("part", ["estimator", "termination"])
+def test_a_body_that_there_is_not_is_named_with_those_that_there_are(part, capsys):
+    command = ["--bags", "none", f"--learner.{part}.body", "cat"]
+    assert exit_status("train", lambda: main(command)) == 2
+    assert f"learner.{part}: unknown body 'cat': expected one of ant, ball" in capsys.readouterr().err
+
+
 def test_bags_of_another_body_are_named_before_anything_is_learned_or_evaluated(bags, tmp_path):
     ant = EstimatorConfig(body="ant"), TerminationConfig(body="ant")
     options = Options((bags,), tmp_path, config=TrainConfig(LearnerConfig(*ant)))
