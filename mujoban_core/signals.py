@@ -141,8 +141,10 @@ class StopSignal:
         deferred: Whether signals wait for the work; while it is false, the first one raises `Interrupted` at once.
     """
 
-    def __init__(self, *, deferred: bool = True) -> None:
+    def __init__(self, *, deferred: bool = True, heard: Callable[[], None] | None = None) -> None:
+        """Call `heard` in a thread of its own when the first signal comes for which the work is not cut short."""
         self.deferred = deferred
+        self._heard = heard
         self.number: int | None = None
         self._at = 0.0
         self._raised = False
@@ -206,6 +208,9 @@ class StopSignal:
 
     def _handler(self, number: int, frame: FrameType | None) -> None:
         again = self.requested and number == signal.SIGINT and time.monotonic() - self._at > AGAIN
+        if self.deferred and not self.requested and self._heard is not None:
+            # In a thread, since what the signal came amid may be writing as well.
+            threading.Thread(target=self._heard, name="heard", daemon=True).start()
         self._note(number)
         if (again or not self.deferred) and not self._raised and not _put_off(number, frame):
             self._raised = True

@@ -224,7 +224,7 @@ class Trainer(Generic[BatchT]):
             with (
                 alone(self.directory.path),
                 TrainingLog(self.directory, total=total, initial=self.progress.samples, unit="sample") as log,
-                StopSignal() as stop,
+                StopSignal(heard=lambda: say(f"{self.directory.path}: stopping after this update")) as stop,
             ):
                 idle = self.complete and self.judged
                 spent = self._loop(log, stop, limits)

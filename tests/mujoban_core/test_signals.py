@@ -64,6 +64,17 @@ def test_work_that_waits_outside_of_python_is_woken():
         assert woken.wait(10) and stop.number == signal.SIGTERM
 
 
+def test_whoever_waits_for_the_work_is_told_once_that_a_signal_was_heard():
+    told, heard = [], threading.Event()
+    with StopSignal(heard=lambda: (told.append(threading.current_thread()), heard.set())):
+        for _ in range(2):
+            signal.raise_signal(signal.SIGTERM)
+        assert heard.wait(10) and len(told) == 1 and told[0] is not threading.main_thread()
+    with StopSignal(heard=lambda: told.append(None)) as stop, pytest.raises(Interrupted), stop.immediate():
+        signal.raise_signal(signal.SIGTERM)
+    assert len(told) == 1
+
+
 def test_outside_of_such_work_a_signal_interrupts():
     with interruptible(), pytest.raises(Interrupted) as raised:
         os.kill(os.getpid(), signal.SIGTERM)
