@@ -32,7 +32,7 @@ from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Source, State, Trainer
 from mujoban_rl.run_directory import RunDirectory
-from mujoban_rl.weights import lineage, provenance
+from mujoban_rl.weights import lineage, provenance, usable_device
 
 MPO_PACE: Final = {"log_updates": 50, "publish_updates": 5}
 """How often a run logs and publishes."""
@@ -121,14 +121,15 @@ class MPOLearner(PlannerLearner[MPOBatch], MoveLearner):
         self, config: MPOConfig, *, device: torch.device | str = "cpu", init: Path | None = None
     ) -> None:
         """Begin with the weights of a planner that imitated, for instance, or with a new network (`beginning`)."""
+        place = usable_device(device)
         torch.manual_seed(config.seed)  # the initial weights
-        network = beginning(config, init).to(device)
+        network = beginning(config, init).to(place)
         if init is None:
             silence_verdicts(network.heads)
         else:
             reset_stay_logit(network)
         super().__init__(
-            config, network, device, teach_pushes=config.teach_pushes, anchor=config.anchor,
+            config, network, place, teach_pushes=config.teach_pushes, anchor=config.anchor,
             critic_first=config.critic_first,
         )  # fmt: skip
 
@@ -160,7 +161,7 @@ def reinforcement(
         bags: Directories of recorded bags whose transitions join the batches.
 
     Raises:
-        ValueError: If the directory belongs to another run, or weights or a bag are not what is expected.
+        ValueError: If the directory belongs to another run, or device, weights or a bag are not what is expected.
     """
     origin = None if init is None else {"path": init.name, "digest": digest(init)}
     run = RunDirectory(directory, config, beside={"init": origin})

@@ -31,6 +31,7 @@ from mujoban_planner.reinforcement import MPO_PACE, MPOConfig, reinforcement
 from mujoban_planner.stages import StagesConfig, train_stages
 from mujoban_rl.actors import ActorOptions
 from mujoban_rl.engine import Cadence
+from mujoban_rl.weights import usable_device
 
 PROG = "mujoban_planner.train"
 
@@ -174,6 +175,7 @@ class Stages(_ActorCommand):
 
     def main(self) -> None:
         """Train."""
+        usable_device(self.device)  # what needs it may come hours later
         train_stages(self.config, self.run, self.cadence(), self.actors, self.seconds, device=self.device)
 
 

@@ -340,6 +340,13 @@ def test_a_mix_of_no_levels_is_named(tmp_path, capsys, method):
     assert "mix is 0.0 0.0 0.0 0.0 0.0: expected five shares" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("options", [["imitation"], ["expert-iteration"], ["mpo"], ["stages", "--stages", "ppo=1"]])
+def test_a_device_that_there_is_not_is_named(tmp_path, capsys, options):
+    arguments = [*options, "--run", str(tmp_path / "run"), "--device", "gpu", "--channels", "8", "--blocks", "1"]
+    assert exit_status("train", partial(train.main, arguments)) == 2
+    assert capsys.readouterr().err == "train: error: device 'gpu': expected cpu or cuda, such as cuda:0\n"
+
+
 def test_a_larger_network_begins_with_what_a_smaller_one_says(tmp_path):
     torch.manual_seed(0)
     small, path = ResidualPlanner(16, 1, judge=True), tmp_path / "small.safetensors"
