@@ -8,6 +8,8 @@ from typing import Annotated
 import tyro
 
 from benchmarks.command import run_benchmark
+from bringup.options import Count
+from mujoban_core.ranges import check_counts, check_not_negative, check_positive
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,11 @@ class Measured:
     """Size of the weights that an actor needs."""
     receive_cpu_seconds_per_gb: float = 2.6
     """CPU time of the learner's process for each gigabyte of experience, without the replay's work."""
+
+    def __post_init__(self) -> None:
+        """Reject actors that deliver nothing, and sizes below 0."""
+        check_positive(self, "frames_per_second")
+        check_not_negative(self, "bytes_per_frame", "weight_bytes", "receive_cpu_seconds_per_gb")
 
 
 @dataclass(frozen=True)
@@ -38,6 +45,11 @@ class Settings:
     """Actor steps for each update of the learner."""
     updates_per_version: float = 10.0
     """Updates between two publications of weights."""
+
+    def __post_init__(self) -> None:
+        """Reject what nothing can be divided by."""
+        check_counts(self, "frames_per_sequence", "machine_cores")
+        check_positive(self, "replay_frames", "frames_per_update", "updates_per_version")
 
 
 def plan(measured: Measured, actors: int, settings: Settings | None = None) -> dict[str, float]:
@@ -73,7 +85,7 @@ def plan(measured: Measured, actors: int, settings: Settings | None = None) -> d
 class Options:
     """Print the plan for a number of actors."""
 
-    actors: int = 1000
+    actors: Count = 1000
     measured: Annotated[Measured, tyro.conf.arg(name="")] = Measured()
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 
