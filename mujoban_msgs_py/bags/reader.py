@@ -246,7 +246,7 @@ class _Doubts:
 
     def __call__(self, what: str) -> None:
         if not self._skip:
-            raise BagError(f"{self._path} is damaged: {what}; to read what is whole, open it with damage skipped")
+            raise BagError(f"{self._path} is damaged: {what}; `ros2 bag reindex BAG` keeps what is whole")
         self.noted.append(what)
 
 

@@ -280,7 +280,7 @@ class McapFile(Storage):
 
     def _damage(self, what: str, *, note: bool = True) -> None:
         if not self._skip:
-            raise BagError(f"{self.path} {what}; to read the rest, open it with damage skipped")
+            raise BagError(f"{self.path} {what}; `ros2 bag reindex BAG` keeps what is whole")
         if note and (text := f"{self.path.name} {what}") not in self.skipped:
             self.skipped.append(text)
 

@@ -186,7 +186,7 @@ def test_damage_to_a_chunk_is_noticed_and_can_be_skipped(tmp_path, compression):
     path = write_bag(tmp_path / "bag", chunk_size=30_000, compression=compression)
     file = path / "bag_0.mcap"
     damage(file, file.stat().st_size // 2)
-    with pytest.raises(BagError, match=r"bag_0\.mcap .*damaged"):
+    with pytest.raises(BagError, match=r"bag_0\.mcap .*damaged.*; `ros2 bag reindex BAG` keeps what is whole$"):
         list(open_bag(path).messages())
     bag = open_bag(path, damaged="skip")
     stamps = [t.stamp // TICK for t in bag.ticks(WANTED)]
