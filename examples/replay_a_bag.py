@@ -19,7 +19,8 @@ import tyro
 from mujoban_core.bodies import BALL
 from mujoban_core.program import exit_status, read_options
 from mujoban_msgs_py import topics
-from mujoban_msgs_py.bags.training import episodes, open_training_bag
+from mujoban_msgs_py.bags import Bag
+from mujoban_msgs_py.bags.training import episodes, find_bags, open_training_bag
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
@@ -33,12 +34,11 @@ class Options:
     """Play every episode of a bag again and say how far the robot is from where it was recorded."""
 
     bag: Annotated[Path, tyro.conf.Positional]
-    """What was recorded."""
+    """What was recorded: a bag, or a folder of bags, such as record.py writes."""
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Run the example."""
-    bag = open_training_bag(read_options(Options, arguments, "replay_a_bag.py").bag, TOPICS)
+def replay(bag: Bag) -> None:
+    """Play every episode of a bag again."""
     body, name = bag.about.get("body", BALL.name), bag.about.get("world", DEFAULT_WORLD)
     for ticks in episodes(bag, TOPICS):
         spec = EpisodeSpec(Level.from_text(ticks[0][0].level), ticks[0][0].seed)
@@ -50,6 +50,12 @@ def main(arguments: Sequence[str]) -> int:
             apart = max(apart, float(np.abs(world.pose[0] - pose).max()))
             world.step(torque[None])
         print(f"seed {spec.seed}: {len(ticks)} ticks, at most {apart:.1e} apart")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the example."""
+    for path in find_bags([read_options(Options, arguments, "replay_a_bag.py").bag]):
+        replay(open_training_bag(path, TOPICS))
     return 0
 
 

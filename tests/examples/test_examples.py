@@ -1,6 +1,7 @@
 """Every example runs as it is printed."""
 
 import runpy
+import shutil
 import sys
 from contextlib import suppress
 from itertools import islice
@@ -150,7 +151,9 @@ def test_a_bag_is_replayed_in_the_world_that_it_names(run, oracles, tmp_path, wo
         for tick in ticks(oracles.policy(), World(1, world=world, max_boxes=1), [spec], camera=True):
             recorder.write(tick)
     (bag,) = (tmp_path / "bag").iterdir()
-    assert f"seed {spec.seed}: {tick.step[0] + 1} ticks, at most 0.0e+00 apart" in run("replay_a_bag.py", bag)
+    shutil.copytree(bag, tmp_path / "bag" / "again")
+    said = f"seed {spec.seed}: {tick.step[0] + 1} ticks, at most 0.0e+00 apart\n"
+    assert run("replay_a_bag.py", bag) == said and run("replay_a_bag.py", tmp_path / "bag") == 2 * said
 
 
 def test_a_bag_is_replayed_with_room_for_as_many_boxes_as_it_was_recorded_with(run, tmp_path):
@@ -166,7 +169,7 @@ def test_a_bag_is_replayed_with_room_for_as_many_boxes_as_it_was_recorded_with(r
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [((), "missing from replay_a_bag.py: PATH"), (("none",), "no bag at none, expected a folder")],
+    [((), "missing from replay_a_bag.py: PATH"), (("none",), "no bag at none: expected a bag or a folder of bags")],
 )
 def test_a_bag_that_is_missing_is_one_line(run, arguments, said):
     line = run("replay_a_bag.py", *arguments)
