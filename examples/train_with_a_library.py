@@ -44,6 +44,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         import torch
         from stable_baselines3 import PPO
         from stable_baselines3.common.evaluation import evaluate_policy
+        from stable_baselines3.common.logger import HumanOutputFormat, Logger
         from stable_baselines3.common.monitor import Monitor
     except ModuleNotFoundError as error:
         raise ValueError(f"{error.name} is not installed: expected pip install 'mujoban[examples]'") from None
@@ -51,6 +52,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     env = Monitor(make())
     # The observations keep their names, which the file then has as well.
     model = PPO("MultiInputPolicy", env, n_steps=min(2048, steps), seed=0, device="cpu", verbose=1)
+    model.set_logger(Logger(None, [HumanOutputFormat(sys.stdout)]))  # the default one makes a folder in /tmp as well
     model.learn(steps)
     model.save("ppo_mujoban")
     mean, deviation = evaluate_policy(model, env, n_eval_episodes=2)

@@ -3,6 +3,7 @@
 import runpy
 import shutil
 import sys
+import tempfile
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -42,8 +43,9 @@ def run(monkeypatch, capsys, tmp_path):
 
 
 @pytest.fixture
-def trained(run):
+def trained(run, tmp_path, monkeypatch):
     """Return what the training example prints; the policy is in the working directory then."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return run("train_with_a_library.py", 8)
 
 
@@ -66,6 +68,11 @@ def test_a_policy_is_trained_with_a_well_known_library_and_evaluated_beside_the_
     assert policy.startswith("trained policy\n  solved ") and " of 1 " in policy
     assert f"privileged, told the ground truth: agent: weights {digest('ppo_mujoban.zip')[:12]}" in policy
     assert modules.startswith("  solved 1 of 1") and ("estimator: oracle" in modules) == bool(stack)
+
+
+def test_a_training_shows_its_progress_and_leaves_no_folder_of_the_librarys(trained, tmp_path):
+    assert "total_timesteps" in trained and (tmp_path / "ppo_mujoban.zip").exists()
+    assert not list(tmp_path.glob("SB3-*"))
 
 
 def test_the_environment_of_the_librarys_example_is_one_that_libraries_take():
