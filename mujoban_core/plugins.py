@@ -198,7 +198,8 @@ def _load(role: str, name: str) -> object:
     if entry is None:
         names = sorted(n.partition(".")[2] for n in _offered() if n.startswith(f"{role}."))
         known = ", ".join(n for n in names if n != _SHIPPED) or "none is installed: run make setup"
-        raise PluginError(f"no {role} is named {name!r}: expected package.module:Class or one of {known}")
+        expected = f"package.module:Class, weights (.safetensors) or one of {known}"
+        raise PluginError(f"no {role} is named {name!r}: expected {expected}")
     try:
         return entry.load()
     except (ImportError, AttributeError) as error:

@@ -21,6 +21,11 @@ def test_a_class_that_cannot_be_made_without_arguments_is_named(source, message)
         load_module("planner", source)
 
 
+def test_what_names_no_module_is_told_all_that_would():
+    with pytest.raises(PluginError, match=r"planner': .*Class, weights \(\.safetensors\) or one of"):
+        Choice.parse("planner", "runs/plans/planner").load()
+
+
 def test_a_module_of_which_an_import_fails_is_named(tmp_path, monkeypatch):
     (tmp_path / "their_planner.py").write_text("from mujoban_core.interfaces import Plannner\n")
     monkeypatch.syspath_prepend(tmp_path)
