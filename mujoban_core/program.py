@@ -33,6 +33,7 @@ _READER_LEFT: Final = 128 + signal.SIGPIPE
 USAGE_ERROR: Final = 2
 """Exit status of a command whose input was bad."""
 _EXPECTED: Final = {
+    errno.EEXIST: "a folder, or a name that is free",
     errno.ENOENT: "one that exists",
     errno.ENOTDIR: "a folder",
     errno.EISDIR: "a file",

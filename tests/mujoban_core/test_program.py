@@ -64,6 +64,13 @@ def test_what_the_system_says_of_a_file_comes_with_what_was_expected(tmp_path, m
     assert capsys.readouterr().err == f"program: error: {said}\n"
 
 
+def test_a_folder_in_whose_place_there_is_a_file_is_named(tmp_path, capsys):
+    (tmp_path / "run").touch()
+    assert exit_status("program", lambda: bool((tmp_path / "run").mkdir(parents=True, exist_ok=True))) == 2
+    said = f"program: error: {tmp_path / 'run'}: File exists, expected a folder, or a name that is free\n"
+    assert capsys.readouterr().err == said
+
+
 def test_what_an_option_of_a_subcommand_rejects_is_said_in_its_own_words():
     @dataclass
     class Settings:
