@@ -136,7 +136,9 @@ class Options:
     modules: Annotated[ModuleOptions, arg(name="")] = field(default_factory=ModuleOptions)
 
     def __post_init__(self) -> None:
-        """Reject what contradicts itself."""
+        """Reject what is no share, or contradicts itself."""
+        if not 0.0 <= self.advanced <= 1.0:
+            raise ValueError(f"--advanced {self.advanced}: expected a share, from 0 to 1")
         if self.undisturbed and self.late_ends:
             raise ValueError("--undisturbed --late-ends: expected one of them, both leave all else undisturbed")
 

@@ -124,3 +124,9 @@ def test_recordings_with_late_ends_go_on_after_an_instruction_is_completed(late,
     assert len(instructions) > 3 and {int(completed.sum()) for completed in instructions} <= after
     with pytest.raises(ValueError, match="expected one of them"):
         Options(tmp_path, undisturbed=True, late_ends=True)
+
+
+@pytest.mark.parametrize("share", [-0.1, 2.0, np.nan])
+def test_a_share_of_advanced_episodes_that_is_none_is_refused(share, tmp_path):
+    with pytest.raises(ValueError, match=rf"^--advanced {share}: expected a share, from 0 to 1$"):
+        Options(tmp_path, advanced=share)
