@@ -7,10 +7,10 @@ imported where it is used, so that a program can tell its options at once.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from tyro.conf import arg
 from tyro.constructors import PrimitiveConstructorSpec
@@ -149,6 +149,10 @@ class ModuleOptions:
         return Stack(choices, self.device, self.look_around, thought, self.threads, body, scout)
 
 
+_OF_ALL: Final = ("device", "threads")
+"""Options of the modules that an agent has as well."""
+
+
 @dataclass(frozen=True)
 class PlayerOptions(ModuleOptions):
     """What plays, and how: the four modules or one agent."""
@@ -160,13 +164,13 @@ class PlayerOptions(ModuleOptions):
         """Return the modules, or the agent.
 
         Raises:
-            ValueError: If a role of `--oracle` is unknown, or modules are named beside an agent.
+            ValueError: If a role of `--oracle` is unknown, or what is of the modules alone is named beside an agent.
         """
         if self.agent is None:
             return self.stack(body)
-        named = [role for role in ROLES if getattr(self, role) != LEARNED]
-        if named or self.oracle:
-            other = f"--{named[0]}" if named else "--oracle"
+        named = [o.name for o in fields(ModuleOptions) if o.name not in _OF_ALL and getattr(self, o.name) != o.default]
+        if named:
+            other = f"--{named[0].replace('_', '-')}"
             raise ValueError(f"--agent {self.agent} {other}: expected one of the two, since an agent plays alone")
         return Solo(Choice.parse(AGENT, self.agent), self.device, self.threads, body)
 

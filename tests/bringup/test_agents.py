@@ -123,6 +123,9 @@ def test_a_named_agent_is_evaluated_with_the_report_of_the_stack(body, tmp_path,
 def test_contradictions_and_unknown_agents_are_one_line():
     with pytest.raises(ValueError, match=r"--agent random --planner: expected one of the two"):
         main(["--agent", "random", "--planner", "oracle"])
+    for option, value in {"look-ahead": "4", "look-around": "50", "thinking": "2", "scout": "mine:Scout"}.items():
+        with pytest.raises(ValueError, match=rf"--agent random --{option}: expected one of the two"):
+            main(["--agent", "random", f"--{option}", value])
     with pytest.raises(ValueError, match="no agent is named 'nobody'"):
         Solo(Choice.parse("agent", "nobody")).policy()
     with pytest.raises(ValueError, match="trained for the body ball"):
