@@ -43,7 +43,7 @@ from mujoban_controller.product import Validation
 from mujoban_core.program import read_options, run_command
 from mujoban_core.ranges import check_counts, check_positive
 from mujoban_core.threads import set_threads
-from mujoban_msgs_py.bags.training import bags_digest
+from mujoban_msgs_py.bags.training import bags_digest, check_bag_share
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.networks import set_scale
 from mujoban_rl.run_directory import RunDirectory
@@ -147,6 +147,7 @@ class Options:
             raise ValueError("--bags: a teacher does not learn from them; expected --stage distil or mpo")
         if not 0.0 < self.bag_share <= 1.0:
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
+        check_bag_share(self.bag_share, Options.bag_share, self.bags)
 
 
 class _Parts:

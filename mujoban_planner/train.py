@@ -22,6 +22,7 @@ import tyro
 
 from mujoban_core.program import read_options, run_command
 from mujoban_core.threads import set_threads
+from mujoban_msgs_py.bags.training import check_bag_share
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore
 from mujoban_planner.imitation import ImitationConfig, imitation
@@ -87,6 +88,10 @@ class Imitation(_ActorCommand):
     """Where lessons are made: in a process beside, unless told otherwise."""
     config: tyro.conf.OmitArgPrefixes[ImitationConfig] = field(default_factory=ImitationConfig)
 
+    def __post_init__(self) -> None:
+        """Reject a share of nothing."""
+        check_bag_share(self.config.bag_share, ImitationConfig.bag_share, self.bags)
+
     def main(self) -> None:
         """Train."""
         trainer = imitation(
@@ -111,6 +116,10 @@ class MPO(_ActorCommand):
     updates: float = float("inf")
     """Stop at so many updates; a later call resumes."""
     config: tyro.conf.OmitArgPrefixes[MPOConfig] = field(default_factory=MPOConfig)
+
+    def __post_init__(self) -> None:
+        """Reject a share of nothing."""
+        check_bag_share(self.config.bag_share, MPOConfig.bag_share, self.bags)
 
     def main(self) -> None:
         """Train."""

@@ -69,6 +69,16 @@ def open_training_bag(path: Path, wanted: Sequence[Topic], *, skip_damaged: bool
     return bag
 
 
+def check_bag_share(share: float, default: float, bags: Sequence[Path]) -> None:
+    """Refuse to take another share than the default one from no bags.
+
+    Raises:
+        ValueError: If there are none.
+    """
+    if share != default and not bags:
+        raise ValueError(f"--bag-share {share:g}: expected --bags, whose share it is")
+
+
 def bags_digest(folders: Sequence[Path]) -> str | None:
     """Return the SHA-256 by which the record of weights names bags, or folders of them: of their names and checksums.
 

@@ -146,6 +146,11 @@ def test_a_run_learns_from_bags_as_well(recorded, tmp_path):
     assert record["bags"] == [recorded[0].name] and record["data"].endswith("; recorded bags")
 
 
+def test_a_share_of_no_bags_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"--bag-share 1: expected --bags, whose share it is"):
+        Options(tmp_path, MPO, bag_share=1.0)
+
+
 @pytest.fixture(params=["mpo", "distil"])
 def offline(request, recorded, tmp_path_factory, monkeypatch):
     """Return what makes runs that learn from bags alone, in which nothing can be simulated."""

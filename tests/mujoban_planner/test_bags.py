@@ -9,7 +9,9 @@ import torch
 from bringup.command import Choice, Stack
 from bringup.record import Job, MixedEpisodes, record
 from mujoban_core.plugins import ROLES
+from mujoban_core.program import exit_status
 from mujoban_msgs_py.bags import BagError
+from mujoban_planner import train
 from mujoban_planner.bag_lessons import BagLessons, Lessons
 from mujoban_planner.imitation import ImitationConfig, imitation
 from mujoban_planner.reinforcement import MPOConfig, reinforcement
@@ -91,3 +93,10 @@ def test_what_is_no_share_is_refused():
     for config in (ImitationConfig, MPOConfig):
         with pytest.raises(ValueError, match=r"--bag-share 1\.5"):
             config(bag_share=1.5)
+
+
+@pytest.mark.parametrize("method", ["imitation", "mpo"])
+def test_a_share_of_no_bags_is_refused(method, tmp_path, capsys):
+    arguments = [method, "--run", str(tmp_path / "run"), "--bag-share", "1"]
+    assert exit_status("train", lambda: train.main(arguments)) == 2
+    assert capsys.readouterr().err == "train: error: --bag-share 1: expected --bags, whose share it is\n"
