@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 import rerun_cli
 
-from bringup.options import LOOPBACK
+from bringup.options import LOOPBACK, address_family, check_own_address
 from mujoban_core import children
 
 _MEMORY: Final = "256MiB"
@@ -106,14 +106,12 @@ def free_port(first: int, address: str = LOOPBACK) -> int:
         ValueError: If the address is none of this machine.
         OSError: If there is none near.
     """
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
-        with socket.socket(family) as probe:
-            probe.bind((address, 0))
+        check_own_address(address)
     except OSError as error:
         raise ValueError(f"address {address}: {error.strerror}; expected one of this machine") from error
     for port in range(first, first + _PORTS):
-        with socket.socket(family) as probe:
+        with socket.socket(address_family(address)) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind((address, port))

@@ -6,6 +6,7 @@ imported where it is used, so that a program can tell its options at once.
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from ipaddress import ip_address
@@ -82,10 +83,27 @@ def _address(given: list[str]) -> str:
 def _interface(given: list[str]) -> str:
     if not given:
         return LOOPBACK
+    text = " ".join(given)
     try:
-        return str(ip_address(" ".join(given)))
+        address = str(ip_address(text))
     except ValueError:
-        raise ValueError(f"{' '.join(given)}, expected an IP address, such as {LOOPBACK} or 0.0.0.0") from None
+        raise ValueError(f"{text}, expected an IP address, such as {LOOPBACK} or 0.0.0.0") from None
+    try:
+        check_own_address(address)
+    except OSError as error:
+        raise ValueError(f"{text}: {error.strerror}, expected an address of this machine, or 0.0.0.0 for all") from None
+    return address
+
+
+def check_own_address(address: str) -> None:
+    """Raise an OSError unless something on this machine can listen on an IP address."""
+    with socket.socket(address_family(address)) as probe:
+        probe.bind((address, 0))
+
+
+def address_family(address: str) -> socket.AddressFamily:
+    """Return the family of an IP address."""
+    return socket.AF_INET6 if ":" in address else socket.AF_INET
 
 
 SPEED = _spec("[SPEED]", _speed, optional=True)

@@ -167,6 +167,12 @@ def test_an_address_that_is_none_is_named():
         read_options(Options, ["--view", "everywhere"], "run_stack.py")
 
 
+@pytest.mark.parametrize("address", ["192.0.2.1", "2001:db8::1"])  # kept for documentation
+def test_an_address_of_another_machine_is_refused_before_anything_is_played(address):
+    with pytest.raises(ValueError, match=rf"^--view {address}: .*, expected an address of this machine, or 0\.0\.0\.0"):
+        read_options(Options, ["--view", address], "run_stack.py")
+
+
 @pytest.mark.timeout(300)
 def test_without_the_view_nothing_of_the_viewer_is_imported():
     code = (
