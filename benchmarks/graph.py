@@ -22,7 +22,7 @@ from bringup.rollout import ticks
 from bringup.stack import PlayOptions, play
 from mujoban_core.plugins import ROLES
 from mujoban_core.sense_plan_act import SensePlanAct
-from mujoban_planner.deliberation import Deliberation
+from mujoban_planner.deliberation import LOOK_AHEAD, Deliberation
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import VALIDATION_SEEDS
@@ -41,7 +41,7 @@ class Options:
     """Roles that oracles play; none by default."""
     realtime: float = 0.0
     """Measure answers in real time at this speed, without and with a search ahead; 0: throughput in lockstep."""
-    look_ahead: int = 400
+    look_ahead: int = LOOK_AHEAD
     """Evaluations of that search."""
     intra_process: bool = True
     """Whether nodes hand over messages that nobody else reads, as `run_stack.py` does; else the middleware has all."""

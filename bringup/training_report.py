@@ -19,6 +19,7 @@ from bringup.model_card import Place, Score, card
 from bringup.pipeline import Entry, Pipeline
 from mujoban_core.files import write_atomically
 from mujoban_core.text import readable
+from mujoban_planner.deliberation import LOOK_AHEAD
 from mujoban_rl.metrics import METRICS, read_metrics
 from mujoban_sokoban.generator import FRESH_SEEDS
 
@@ -45,7 +46,9 @@ class Evaluation(NamedTuple):
 
 EVALUATIONS: Final = {
     "evaluation": Evaluation("all four modules, the planner's policy alone", ("--look-ahead", "0")),
-    "evaluation_ahead": Evaluation("all four modules, with a search ahead of 400 evaluations", ("--look-ahead", "400")),
+    "evaluation_ahead": Evaluation(
+        f"all four modules, with a search ahead of {LOOK_AHEAD} evaluations", ("--look-ahead", str(LOOK_AHEAD))
+    ),
 }
 """By the name of the stage."""
 _PLACE = Place("python -m bringup.train_all", None, "levels for validation by which nothing was chosen")
