@@ -11,6 +11,7 @@ from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES, shipped_weights
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_planner.discrete_mpo import MPOSettings
+from mujoban_planner.teacher import DISCOUNT
 from mujoban_rl.losses.mpo_continuous import MPOConfig
 from mujoban_rl.losses.mpo_discrete import DiscreteMPOConfig
 
@@ -45,8 +46,8 @@ class PlannerSettings:
     """Decisions that are kept."""
     n_step: int = 3
     """Decisions of a return."""
-    discount: float = 0.99
-    """Of an instruction."""
+    discount: float = DISCOUNT
+    """Of an instruction; by default that of the planner whose head goes on learning."""
     rate: float = 3e-5
     critic_first: int = 400
     """Updates in which its critic learns alone."""
