@@ -17,6 +17,7 @@ from mujoban_baselines.drawing import Drawing
 from mujoban_baselines.networks import BodySense, Recurrent, RecurrentAgent, Sights, dense, view_encoder
 from mujoban_baselines.repeat import Repeating
 from mujoban_baselines.subgoals import Subgoals
+from mujoban_controller.controller import FEATURES, HIDDEN, WIDTHS
 from mujoban_core.agent import Agent, AgentInput
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
@@ -40,9 +41,9 @@ class Size(NamedTuple):
 
 
 SIZES: Final = {
-    "S": Size((24, 32, 48, 64), 256, 192, 0),
-    "M": Size((24, 32, 48, 64), 512, 384, 0),
-    "L": Size((24, 32, 48, 64), 512, 384, 2),
+    "S": Size(WIDTHS, FEATURES, HIDDEN, 0),
+    "M": Size(WIDTHS, 512, 384, 0),
+    "L": Size(WIDTHS, 512, 384, 2),
 }
 """Small is the controller without instructions; medium widens LSTM and layers; large adds layers (paper D.1)."""
 

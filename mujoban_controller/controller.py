@@ -19,7 +19,7 @@ of a track.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -45,6 +45,12 @@ INPUT_FIELDS = TICK
 """What the controller sees, as recorded windows name it."""
 MEMORY_FIELDS = ("memory0", "memory1", "memory2")
 """Its memory before a tick, `Recurrent`."""
+WIDTHS: Final = (24, 32, 48, 64)
+"""Channels of the ResNet's stem and of each of its residual blocks."""
+FEATURES: Final = 256
+"""Width of fully connected layers."""
+HIDDEN: Final = 192
+"""Width of the LSTM."""
 _CLIP = 5.0
 _NEAR = 4.0
 """How much closer the way is looked at at its end."""
@@ -139,9 +145,9 @@ class VisuomotorController(Compilable, GoalPolicy, Controller):
     def __init__(
         self,
         body: str = "ball",
-        channels: Sequence[int] = (24, 32, 48, 64),
-        features: int = 256,
-        hidden: int = 192,
+        channels: Sequence[int] = WIDTHS,
+        features: int = FEATURES,
+        hidden: int = HIDDEN,
         place: bool = False,
         way: bool = False,
     ) -> None:

@@ -29,7 +29,7 @@ import torch
 import tyro
 
 from mujoban_controller.bag_ticks import BagPlayer, BagTicks
-from mujoban_controller.controller import VisuomotorController
+from mujoban_controller.controller import FEATURES, HIDDEN, WIDTHS, VisuomotorController
 from mujoban_controller.distil import DistilConfig, DistilLearner, DistilPlayer
 from mujoban_controller.episodes import TrainingEpisodes
 from mujoban_controller.goal_settings import GoalTaskConfig
@@ -60,9 +60,9 @@ PLANNER_NODES = 20_000
 class NetworkConfig:
     """What the camera policy is made of."""
 
-    channels: tuple[int, ...] = (24, 32, 48, 64)
-    features: int = 256
-    hidden: int = 192
+    channels: tuple[int, ...] = WIDTHS
+    features: int = FEATURES
+    hidden: int = HIDDEN
     place: bool = True
     """Whether it keeps where the robot is within its cell."""
     way: bool = True
