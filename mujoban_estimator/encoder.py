@@ -21,7 +21,7 @@ FEATURE_SIZE: Final = FRAME_SIZE // STRIDE
 class FrameEncoder(nn.Module):
     """Frames uint8 [N, 64, 64, 3] -> features [N, C, 16, 16]."""
 
-    def __init__(self, stem: int = 16, channels: int = 32, blocks: int = 2) -> None:
+    def __init__(self, stem: int, channels: int, blocks: int) -> None:
         """Make the network: `stem` channels at half resolution, then `channels` and `blocks` at a quarter."""
         super().__init__()
         self.channels = channels
