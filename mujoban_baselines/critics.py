@@ -13,9 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_baselines.networks import BodySense
-from mujoban_baselines.task import MAX_BOXES
 from mujoban_core.bodies import get_body
-from mujoban_core.grid import CHANNELS, GRID_SIZE, turn_to_instruction
+from mujoban_core.grid import CHANNELS, GRID_SIZE, MAX_BOXES, turn_to_instruction
 
 _WIDTH = 128
 

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mujoban_baselines.task import MAX_BOXES, Task, TaskStep
+from mujoban_baselines.task import Task, TaskStep
 from mujoban_core.bodies import BALL
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, TARGET, WALL
+from mujoban_core.grid import AGENT, BOX, CHANNELS, GRID_SIZE, MAX_BOXES, TARGET, WALL
 from mujoban_rl.engine import State
 from mujoban_sim.sights import Sights
 

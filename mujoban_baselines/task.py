@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import get_body
-from mujoban_core.grid import CONTROL_PERIOD, DIFFICULTIES
+from mujoban_core.grid import CONTROL_PERIOD, MAX_BOXES
 from mujoban_core.ranges import check_counts
 from mujoban_rl.engine import State
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -31,8 +31,6 @@ LEVELS: Final[dict[str, dict[int, float]]] = {
     "easy": {1: 1.0},
 }
 """How often each difficulty is drawn (paper D.1)."""
-MAX_BOXES: Final = max(boxes for _, boxes in DIFFICULTIES.values())
-"""K: all levels are played in one world."""
 _LONGEST: Final = 1e6
 """Seconds that no episode takes."""
 

@@ -36,6 +36,8 @@ COMPLETION_TOLERANCE: Final = 0.1
 
 DIFFICULTIES: Final[dict[int, tuple[int, int]]] = {1: (5, 1), 2: (7, 1), 3: (7, 2), 4: (8, 3), 5: (10, 4)}
 """Difficulty -> (grid size counting the outer wall, number of boxes) (paper Table 3)."""
+MAX_BOXES: Final = max(boxes for _, boxes in DIFFICULTIES.values())
+"""Of a generated level: K where levels of all difficulties are played in one world."""
 
 
 class Instruction(IntEnum):
