@@ -15,14 +15,12 @@ from PIL import Image, ImageDraw, ImageFont
 
 from bringup.overlay import COLOURS
 from bringup.view import ARROWS
-from mujoban_core.grid import CONTROL_PERIOD, OFFSETS_RC
+from mujoban_core.grid import CONTROL_PERIOD, GRID_SIZE, OFFSETS_RC
 from mujoban_core.grid import Instruction as Direction
 from mujoban_core.plugins import AGENT, PRIVILEGED, ROLES, is_privileged
 
 CELL: Final = 16
 """Pixels along the edge of a cell of a map."""
-_CELLS: Final = 10
-"""Along the edge of a map."""
 _KEY_CELLS: Final = 2.5
 """Height of the key below a map, in cells."""
 _SHARPNESS: Final = 4
@@ -102,14 +100,14 @@ def describe(stream: rr.RecordingStream) -> None:
 def _describe_map(stream: rr.RecordingStream, place: str) -> None:
     """Log the key of a map below it, as a picture: Rerun's own labels are small, and wrap."""
     stream.log(f"{place}/key", rr.Image(_key_picture()), static=True)
-    below = rr.Transform3D(translation=(0.0, CELL * _CELLS, 0.0), scale=1.0 / _SHARPNESS)
+    below = rr.Transform3D(translation=(0.0, CELL * GRID_SIZE, 0.0), scale=1.0 / _SHARPNESS)
     stream.log(f"{place}/key", below, static=True)
 
 
 def _key_picture() -> NDArray[np.uint8]:
     """Return what the colours of a map stand for, in two rows, RGB."""
     unit = CELL * _SHARPNESS
-    image = Image.new("RGB", (unit * _CELLS, round(unit * _KEY_CELLS)), (255, 255, 255))
+    image = Image.new("RGB", (unit * GRID_SIZE, round(unit * _KEY_CELLS)), (255, 255, 255))
     brush = ImageDraw.Draw(image)
     font = ImageFont.load_default(0.7 * unit)
     starts = (0.2, 2.9, 6.4)
@@ -140,7 +138,7 @@ def torque_curves(joints: Sequence[str], size: int) -> rr.SeriesLines:
 
 def blueprint() -> rrb.Blueprint:
     """Return the arrangement of the view."""
-    bounds = rrb.VisualBounds2D(x_range=(0, CELL * _CELLS), y_range=(0, CELL * (_CELLS + _KEY_CELLS)))
+    bounds = rrb.VisualBounds2D(x_range=(0, CELL * GRID_SIZE), y_range=(0, CELL * (GRID_SIZE + _KEY_CELLS)))
     maps = [
         rrb.Spatial2DView(
             origin=place, contents=[place, f"{place}/key", f"{place}/instruction"], name=name, visual_bounds=bounds

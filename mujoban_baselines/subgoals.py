@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_core.grid import AGENT, GRID_SIZE, Instruction
+from mujoban_core.grid import AGENT, CHANNELS, GRID_SIZE, Instruction
 from mujoban_core.interfaces import counter_uniform
 from mujoban_sokoban.rules import abstract_successor
 
@@ -40,7 +40,7 @@ class Subgoals(NamedTuple):
     def none_yet(cls, seeds: NDArray[np.int64]) -> Subgoals:
         """Return what holds before the first tick of episodes with the given random streams, [B]."""
         b = len(seeds)
-        target = np.zeros((b, GRID_SIZE, GRID_SIZE, 4), np.bool_)
+        target = np.zeros((b, GRID_SIZE, GRID_SIZE, len(CHANNELS)), np.bool_)
         streams = np.asarray(seeds, np.int64) ^ _STREAM
         return cls(target, np.full(b, SUBGOAL_LIMIT, np.int64), streams, np.zeros(b, np.int64))
 
