@@ -14,19 +14,10 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import ArrayLike, NDArray
 
+from mujoban_core import grid
 from mujoban_core.bodies import FIRST_PERSON_CAMERA, get_body
 from mujoban_core.camera import FRAME_SIZE
-from mujoban_core.grid import (
-    AGENT,
-    CHANNELS,
-    COMPLETION_TOLERANCE,
-    GRID_SIZE,
-    MAX_BOXES,
-    TARGET,
-    WALL,
-    cell_to_xy,
-    xy_to_cell,
-)
+from mujoban_core.grid import AGENT, CHANNELS, COMPLETION_TOLERANCE, GRID_SIZE, TARGET, WALL, cell_to_xy, xy_to_cell
 from mujoban_core.interfaces import GroundTruth, Observation
 from mujoban_sim.cameras import Cameras
 from mujoban_sim.checks import check_places, check_rows, hand_over_torque
@@ -98,7 +89,7 @@ class World(Portable):
         *,
         body: str = "ball",
         world: str = DEFAULT_WORLD,
-        max_boxes: int = MAX_BOXES,
+        max_boxes: int = grid.MAX_BOXES,
         time_limit: int | None = None,
         threads: int = 1,
         tolerance: float = COMPLETION_TOLERANCE,
