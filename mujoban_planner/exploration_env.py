@@ -25,7 +25,6 @@ from mujoban_rl.engine import State
 
 SHOWN, GAIN, DISTANCE, FIRST = range(4, 8)
 """Channels behind those of the abstract state: cells that have been in view, and the `Survey` from the robot's cell."""
-CHANNELS: Final = FIRST + 1
 _CHANGING: Final = ("level", "agent", "seen", "guess", "steps")
 
 
