@@ -34,7 +34,6 @@ class RenderScene:
     """A model to draw from, and where its parts are."""
 
     model: mujoco.MjModel
-    slots: int
     static_geom: int
     skyline_geom: int
     box_geoms: NDArray[np.int64]
@@ -131,7 +130,6 @@ def build_scene(body: Body, max_boxes: int, slots: int, size: int, preset: World
     model = spec.compile()
     scene = RenderScene(
         model,
-        slots,
         model.geom("static").id,
         model.geom("skyline").id,
         np.array([model.geom(f"box{i}").id for i in range(max_boxes)], np.int64),

@@ -94,7 +94,6 @@ class World(Portable):
         threads: int = 1,
         tolerance: float = COMPLETION_TOLERANCE,
         max_box_speed: float = MAX_BOX_SPEED,
-        cached_scenes: int = 32,
     ) -> None:
         """Make B worlds; every row must be reset before the first step.
 
@@ -107,7 +106,6 @@ class World(Portable):
             threads: threads for physics; the results do not depend on it.
             tolerance: tolerance of the completion rule in cells.
             max_box_speed: speed in cells per second below which a pushed box counts as placed.
-            cached_scenes: compiled levels to keep, of 0.3 MB each, which 2 ms make anew.
 
         Raises:
             ValueError: if an argument is out of its range.
@@ -129,7 +127,7 @@ class World(Portable):
         self._episodes: list[EpisodeSpec | None] = [None] * batch
         self._started = False
         self._allocate()
-        self._start_physics(cached_scenes)
+        self._start_physics()
 
     def _allocate(self) -> None:
         b, k, n = self.batch, self.max_boxes, GRID_SIZE
@@ -153,8 +151,8 @@ class World(Portable):
         self.solved = np.zeros(b, np.bool_)
         self.truncated = np.zeros(b, np.bool_)
 
-    def _start_physics(self, cached_scenes: int) -> None:
-        self._scenes = SceneCache(self.body, self.max_boxes, self.preset, cached_scenes)
+    def _start_physics(self) -> None:
+        self._scenes = SceneCache(self.body, self.max_boxes, self.preset)
         empty = self._scenes.model(np.zeros((GRID_SIZE, GRID_SIZE), np.bool_))
         self._models = [empty] * self.batch
         # Each row keeps its MjData, so that sensors at the new state cost no second pass.
