@@ -305,8 +305,9 @@ class MPOLearner(ProductLearner[Batch]):
         )
         target = td_target(reward, discount, value.flatten(), self.config.gamma)
         predicted = self.critic(batch["features"][:, :starts], batch["action"][:, :starts]).flatten()
-        # Nobody knows what would have come after an episode that was cut off.
-        known = ~truncated.any(1)
+        # Nobody knows what would have come after an episode that was cut off; behind an end that does not matter.
+        counts = torch.cat([torch.ones_like(discount[:, :1]), discount.cumprod(1)[:, :-1]], 1) > 0.0
+        known = ~(truncated & counts).any(1)
         return (functional.mse_loss(predicted, target, reduction="none") * known).sum() / known.sum().clamp(min=1)
 
     def _update_policy(self, batch: Batch, draws: _Draws, guard: NaNGuard) -> dict[str, float]:

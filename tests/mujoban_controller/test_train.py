@@ -252,6 +252,24 @@ def test_what_would_have_come_after_an_episode_that_was_cut_off_teaches_the_crit
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
+def test_a_failure_teaches_the_critic_also_where_the_next_episode_was_cut_off(tmp_path):
+    learner = make_trainer(Options(tmp_path, STAGES["mpo"], evaluation_episodes=0)).learner
+    learner.config = replace(learner.config, n_step=3)
+    features = learner.critic.state.in_features
+    batch = {
+        "features": torch.zeros(1, 4, features),
+        "action": torch.zeros(1, 4, learner.policy.action_size),
+        "reward": torch.full((1, 4), -1.0),
+        "discount": torch.tensor([[1.0, 0.0, 0.0, 1.0]]),
+    }
+    ends = {"failed, then cut off": [0, 0, 1, 0], "cut off": [0, 1, 0, 0], "cut off at once": [1, 0, 0, 0]}
+    losses = {
+        name: float(learner._critic_loss(batch | {"truncated": torch.tensor([cut]).bool()}, torch.zeros(1, 1)))
+        for name, cut in ends.items()
+    }
+    assert losses["failed, then cut off"] > 0.1 and losses["cut off"] == 0.0 == losses["cut off at once"]
+
+
 def test_imitation_prefers_the_teachers_torque():
     torch.manual_seed(0)
     controller = VisuomotorController(channels=(8, 8, 8), features=16, hidden=8)
