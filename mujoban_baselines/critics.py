@@ -10,17 +10,17 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from mujoban_baselines.networks import BodySense
 from mujoban_core.bodies import get_body
 from mujoban_core.grid import CHANNELS, GRID_SIZE, MAX_BOXES, turn_to_instruction
+from mujoban_rl.networks import ActionCritic
 
 _WIDTH = 128
 
 
-class Critic(nn.Module):
-    """Q of a state and an action; the state is encoded once for all actions that are weighed in it."""
+class Critic(ActionCritic):
+    """Q of a state and an action."""
 
     sees: tuple[str, ...] = ()
     """What it reads of the task beside what the agent sees."""
@@ -35,10 +35,7 @@ class Critic(nn.Module):
     def __init__(self, body: str, width: int = _WIDTH) -> None:
         """Build what follows the encoding of the state, which has H = `width` features."""
         super().__init__()
-        self.action = nn.Linear(get_body(body).action_size, width, bias=False)
-        self.norm = nn.LayerNorm(width)
-        self.hidden = nn.Linear(width, width)
-        self.value = nn.Linear(width, 1)
+        self.add_head(get_body(body).action_size, width)
 
     @abstractmethod
     def state(self, batch: Mapping[str, Tensor], features: Tensor) -> Tensor:
@@ -51,8 +48,7 @@ class Critic(nn.Module):
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return Q, [...], of encoded states [..., H] and actions [..., U], whose leading axes broadcast."""
-        x = torch.tanh(self.norm(state + self.action(action.clamp(-1.0, 1.0))))
-        return self.value(functional.elu(self.hidden(x))).squeeze(-1)
+        return self.judge(state, action)
 
 
 class SymmetricCritic(Critic):

@@ -16,13 +16,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn import functional
 
 from mujoban_controller.drivers import Driver
 from mujoban_controller.goal_features import feature_layout
 from mujoban_controller.policy import GoalPolicy
 from mujoban_core.bodies import get_body
-from mujoban_rl.networks import Gaussian, Normaliser
+from mujoban_rl.networks import ActionCritic, Gaussian, Normaliser
 
 if TYPE_CHECKING:
     from mujoban_controller.goal_task import GoalTask
@@ -105,7 +104,7 @@ class Value(nn.Module):
         return self.layers(self.normaliser(features)).squeeze(-1)
 
 
-class Critic(nn.Module):
+class Critic(ActionCritic):
     """Q of privileged features and actions (the asymmetric critic of paper C.3)."""
 
     def __init__(self, body: str = "ball", width: int = 128, extra: int = 0) -> None:
@@ -115,13 +114,8 @@ class Critic(nn.Module):
         self.config = {"body": body, "width": width, "extra": extra}
         self.normaliser = Normaliser(size)
         self.state = nn.Linear(size, width)
-        self.action = nn.Linear(get_body(body).action_size, width, bias=False)
-        self.norm = nn.LayerNorm(width)
-        self.hidden = nn.Linear(width, width)
-        self.value = nn.Linear(width, 1)
+        self.add_head(get_body(body).action_size, width)
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Return Q, [...], given features [..., D] and actions [..., U], whose leading axes broadcast."""
-        state = self.state(self.normaliser(features))
-        x = torch.tanh(self.norm(state + self.action(action.clamp(-1.0, 1.0))))
-        return self.value(functional.elu(self.hidden(x))).squeeze(-1)
+        return self.judge(self.state(self.normaliser(features)), action)

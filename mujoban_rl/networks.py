@@ -127,6 +127,30 @@ class Normaliser(nn.Module):
         return ((features - self.mean) / (self.variance + 1e-4).sqrt()).clamp(-_CLIP, _CLIP)
 
 
+class ActionCritic(nn.Module):
+    """What critics of torques have in common: Q of a state, which is encoded once for all actions weighed in it."""
+
+    action: nn.Linear
+    norm: nn.LayerNorm
+    hidden: nn.Linear
+    value: nn.Linear
+
+    def add_head(self, actions: int, width: int) -> None:
+        """Make what follows the encoding of states, [..., H = `width`], for U = `actions`.
+
+        Checkpoints and draws of weights know layers by their order: what is made before this comes first.
+        """
+        self.action = nn.Linear(actions, width, bias=False)
+        self.norm = nn.LayerNorm(width)
+        self.hidden = nn.Linear(width, width)
+        self.value = nn.Linear(width, 1)
+
+    def judge(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return Q, [...], of encoded states [..., H] and actions [..., U], whose leading axes broadcast."""
+        x = torch.tanh(self.norm(state + self.action(action.clamp(-1.0, 1.0))))
+        return self.value(functional.elu(self.hidden(x))).squeeze(-1)
+
+
 class ResidualBlock(nn.Module):
     """Two 3x3 convolutions beside a strided 1x1 one (He et al. 2016), without normalisation."""
 
