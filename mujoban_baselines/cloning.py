@@ -162,7 +162,5 @@ class CloningLearner(Learner[Batch]):
         if norm is None:
             return {}
         self._memory = Recurrent(*(part.detach() for part in output.memory))
-        sense = self.agent.sense.normaliser
-        if int(sense.count) < self.config.normalised * self.config.rows:
-            sense.update(batch["proprio"][:, 0])
+        self.agent.sense.meet(batch["proprio"][:, 0], self.config.normalised)
         return {"loss/torque": float(loss.detach()), "gradient_norm": float(norm)}

@@ -107,7 +107,7 @@ class VTraceLearner(Learner[Arrays]):
             part = {name: values[start : start + batch_size] for name, values in ticks.items()}
             meter.add(self._learn(part, guard))
         if meter:
-            self._normalise(ticks["proprio"][:, 0])
+            self.agent.sense.meet(ticks["proprio"][:, 0], self.config.normalised)
         return meter.take()
 
     def _learn(self, ticks: Mapping[str, Tensor], guard: NaNGuard) -> dict[str, float]:
@@ -149,8 +149,3 @@ class VTraceLearner(Learner[Arrays]):
             x[:, :-1].T for x in (log_prob, behaviour, entropy, value, reward, discount)
         )
         return vtrace_loss(log_pi, log_mu, spread, v, value[:, -1], r, gamma, self.config.loss)
-
-    def _normalise(self, proprio: Tensor) -> None:
-        sense = self.agent.sense.normaliser
-        if int(sense.count) < self.config.normalised * len(proprio):
-            sense.update(proprio)

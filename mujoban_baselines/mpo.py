@@ -243,9 +243,7 @@ class MPOLearner(Learner[Batch]):
         for online, target in senses:
             if online is None or target is None:
                 continue
-            # A sense that has been normalised, as that of a clone, stays as it is.
-            if int(online.normaliser.count) < self.config.normalised * len(proprio):
-                online.normaliser.update(proprio)
+            if online.meet(proprio, self.config.normalised):
                 target.normaliser.load_state_dict(online.normaliser.state_dict())
 
 

@@ -43,6 +43,16 @@ class BodySense(nn.Module):
         rest[self._angle] = False
         self._rest = torch.from_numpy(np.flatnonzero(rest))
 
+    def meet(self, proprio: Tensor, updates: int) -> bool:
+        """Normalise also by o_pr, [M, P], in the first updates, each with as many; return whether it was one of these.
+
+        One that has been normalised before, as that of a clone, stays as it is.
+        """
+        first = int(self.normaliser.count) < updates * len(proprio)
+        if first:
+            self.normaliser.update(proprio)
+        return first
+
     def forward(self, proprio: Tensor, pose: Tensor | None = None) -> Tensor:
         """Return what is felt, [M, size], of o_pr [M, P] and o_pos [M, 3]."""
         angle = proprio[:, self._angle]
