@@ -30,7 +30,7 @@ from mujoban_rl.losses.mpo import scalars
 from mujoban_rl.losses.mpo_continuous import MPOConfig, MPOLoss, check_samples, paired_noise
 from mujoban_rl.losses.returns import Returns, windowed_returns
 from mujoban_rl.optimise import guarded_step
-from mujoban_rl.replay import SequenceReplay
+from mujoban_rl.replay import SequenceReplay, steps_per_update
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import save_weights
 
@@ -94,7 +94,7 @@ class MPOTrainingConfig:
     @property
     def steps_per_update(self) -> float:
         """Decisions that are collected for each update."""
-        return self.windows * (self.window - self.overlap) / self.reuse
+        return steps_per_update(self.windows, self.window - self.overlap, self.reuse)
 
 
 class WindowStore(ReplayStore[Batch]):

@@ -46,6 +46,7 @@ from mujoban_core.threads import set_threads
 from mujoban_msgs_py.bags.training import bags_digest, check_bag_share
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.networks import set_scale
+from mujoban_rl.replay import steps_per_update
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import WeightsError, load_weights, origin, provenance, usable_device
 from mujoban_sim.oracles import OraclePlanner
@@ -249,11 +250,11 @@ class _Parts:
         rows: int = 0,
     ) -> ReplaySource:  # fmt: skip
         width = self.config.task.batch + rows
-        per_batch = settings.windows * (settings.window - settings.skipped)
+        per_batch = steps_per_update(settings.windows, settings.window - settings.skipped, settings.reuse)
         critic = settings.critic_draw if isinstance(settings, AsymmetricConfig) else None
         draw = Draw(
             capacity=max(settings.replay // settings.sequence, 1), length=settings.sequence, window=settings.window,
-            windows=settings.windows, per_tick=width * settings.reuse / per_batch, first=settings.first // width,
+            windows=settings.windows, per_tick=width / per_batch, first=settings.first // width,
             critic=critic,
         )  # fmt: skip
         return ReplaySource(player, draw, self.generator(), recorded)

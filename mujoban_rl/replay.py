@@ -22,6 +22,17 @@ Ticks = Mapping[str, NDArray[Any] | Tensor]
 """Fields by name; tensors are on the CPU."""
 
 
+def steps_per_update(windows: int, ticks: int, reuse: float) -> float:
+    """Return how many new steps there are for each update, so that one is learned from `reuse` times on average.
+
+    Args:
+        windows: M.
+        ticks: Of a window, those in which something is learned.
+        reuse: How often.
+    """
+    return windows * ticks / reuse
+
+
 class SequenceReplay:
     """The last C sequences of L ticks each. Fields are laid out by the first sequences that are added."""
 

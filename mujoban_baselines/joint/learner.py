@@ -26,7 +26,7 @@ from mujoban_planner.move_learner import MoveLearner
 from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.limits import NaNGuard
-from mujoban_rl.replay import SequenceReplay
+from mujoban_rl.replay import SequenceReplay, steps_per_update
 from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import load_weights, save_weights
 
@@ -158,6 +158,6 @@ def joint_parts(
     own = settings.controller
     source = ActorSource(
         actors.pool(factory), JointStore(settings, generators[0]),
-        steps_per_update=own.windows * (own.window - own.skipped) / own.reuse, first_steps=own.first,
+        steps_per_update=steps_per_update(own.windows, own.window - own.skipped, own.reuse), first_steps=own.first,
     )  # fmt: skip
     return JointLearner(networks, settings, generators[1]), source
