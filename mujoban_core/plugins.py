@@ -89,7 +89,7 @@ def load_scout(source: str, weights: Path | None = None, device: str = "cpu", bo
 
     Args:
         source: "scripted", "learned", the name of another entry point `scout.NAME`, or `package.module:Class`.
-        weights: Weights of the learned one instead of those that ship.
+        weights: Weights of the learned one; none ship.
         device: Device of the learned one.
         body: The body that is played, if it is known.
 
@@ -97,6 +97,8 @@ def load_scout(source: str, weights: Path | None = None, device: str = "cpu", bo
         PluginError: If it is unknown, or no `Scout`.
         ValueError: If weights are missing, damaged or of another body.
     """
+    if source == LEARNED and weights is None:
+        weights = shipped_weights(SCOUT)
     scout = _make(SCOUT, Scout, source, weights, device)
     if body is not None:
         check_body(SCOUT, scout, body)
@@ -160,9 +162,13 @@ def shipped_weights(role: str, body: str | None = None) -> Path:
 
     Those of a body lie beside: `controller_ant.safetensors` for the body "ant". Where there are none, those of the
     default body are meant, which may fit (a planner's do) or not (`check_body`).
+
+    Raises:
+        PluginError: If there is no such role, or none of it ship.
     """
-    if role != SCOUT:
-        _interface(role)
+    if role == SCOUT:
+        raise PluginError(f"the {LEARNED} scout: none of its weights ship, expected some (.safetensors)")
+    _interface(role)
     path = Path(str(_load(role, _SHIPPED)))
     own = path.with_stem(f"{role}_{body}")
     return own if own.is_file() else path

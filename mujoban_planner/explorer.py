@@ -29,9 +29,6 @@ _SCALE: Final = (1.0, 1.0, 1.0, 1.0, 1.0, 0.1, 0.1)
 """Of the channels that the network reads: all but the first step."""
 _PLANES: Final = len(_SCALE)
 
-SHIPPED: Final = Path(__file__).parent / "weights" / "explorer.safetensors"
-"""The weights that ship."""
-
 
 class ExplorerOutput(NamedTuple):
     """What the network says about states."""
@@ -89,14 +86,14 @@ class Explorer(nn.Module, Scout):
         return Instruction(best) if q[0, best] > 0.0 else None
 
 
-def load(path: str | Path | None = None, device: str = "cpu") -> Explorer:
+def load(path: str | Path, device: str = "cpu") -> Explorer:
     """Return an explorer with trained weights.
 
     Args:
-        path: A `.safetensors` file with its record beside; the shipped weights by default.
+        path: A `.safetensors` file with its record beside; none ships.
         device: Where the network is put.
 
     Raises:
         WeightsError: If the weights are missing, damaged or not an explorer's.
     """
-    return load_weights(Explorer, Path(path or SHIPPED), device)
+    return load_weights(Explorer, path, device)

@@ -12,11 +12,12 @@ import torch
 from cart import CART
 
 from bringup import evaluate
+from bringup.command import Choice
 from mujoban_core.bodies import ANT, BALL, BODIES
 from mujoban_core.files import digest
 from mujoban_core.grid import AGENT, BOX, WALL, Instruction
 from mujoban_core.look_around import WALKS, LookAroundPlanner, Scout
-from mujoban_core.plugins import LEARNED, load_scout
+from mujoban_core.plugins import LEARNED, SCOUT, PluginError, load_scout
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.exploration_env import SHOWN, ExplorationEnvironment, ExplorationReward
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore, judge_scout
@@ -143,6 +144,13 @@ def test_an_explorer_of_any_body_is_trained_and_scouts_for_that_body_alone(tmp_p
     assert isinstance(load_scout(LEARNED, weights, body="cart"), Explorer)
     with pytest.raises(ValueError, match="scout was trained for the body cart: expected weights for ball"):
         load_scout(LEARNED, weights, body="ball")
+
+
+def test_a_learned_scout_without_weights_says_that_none_ship():
+    with pytest.raises(PluginError, match=r"learned scout: none of its weights ship, expected some \(\.safe"):
+        load_scout(LEARNED)
+    with pytest.raises(PluginError, match="the learned scout: none of its weights ship"):
+        Choice(SCOUT, LEARNED).identity()
 
 
 def test_a_batch_with_nan_is_refused(tmp_path):
