@@ -149,7 +149,7 @@ class GoalTask:
 
     @property
     def elapsed(self) -> NDArray[np.float64]:
-        """Share of the time limit that the instruction in force has had, [B]."""
+        """Ticks that the instruction in force has had, in units of `INSTRUCTION_LIMIT`, [B]."""
         return self._noise.elapsed / INSTRUCTION_LIMIT
 
     @property
@@ -210,9 +210,9 @@ class GoalTask:
         before, change = self._reward.before(world), torque - self.torque
         world.step(torque)
         self.torque = np.array(torque, np.float32)
-        completed, lying = world.completed.copy(), fallen(world)
-        ended = self._noise.step(completed, self._distance()) | world.done | lying
-        beyond = self._beyond(completed)
+        completed, lying, offsets = world.completed.copy(), fallen(world), goal_offsets(world)
+        ended = self._noise.step(completed, self._distance(offsets)) | world.done | lying
+        beyond = self._beyond(completed, offsets[:, 2:])
         ended |= beyond
         failed = ended & ~completed & ((self._noise.elapsed >= config.terminations.limit) | beyond) | lying
         reward = self._reward.after(world, before, change, ended & completed, failed)
@@ -221,7 +221,8 @@ class GoalTask:
         rows = np.flatnonzero(ended)
         # An instruction that the end of its episode cut short says nothing.
         judged = np.flatnonzero(ended & (completed | failed))
-        outcomes = [self._outcome(b, bool(completed[b] and not failed[b]), bool(lying[b])) for b in judged.tolist()]
+        achieved, across = completed & ~failed, np.abs(offsets[:, 3]) > config.tolerance
+        outcomes = [self._outcome(b, bool(achieved[b]), bool(across[b]), bool(lying[b])) for b in judged.tolist()]
         self._failures = np.where(failed, self._failures + 1, np.where(ended, 0, self._failures))
         given_up = (self._failures >= config.patience) | (self._without_plan >= _NO_PLAN)
         over = world.done | lying | (ended & ((world.steps >= self._horizon) | given_up))
@@ -234,12 +235,11 @@ class GoalTask:
             self._issue(rows)
         return TaskStep(reward, (~(failed | over)).astype(np.float32), over & ~failed, outcomes, episodes)
 
-    def _beyond(self, completed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return where a pushed box is past its target for good, [B]."""
+    def _beyond(self, completed: NDArray[np.bool_], left: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return where a pushed box, with so far to go along and across its lane, [B, 2], is past it for good, [B]."""
         if self.config.overshoot == math.inf:
             return np.zeros_like(completed)
         world, goals = self.world, self.world.goals
-        left = goal_offsets(world)[:, 2:]
         resting = world.box_speed[np.arange(world.batch), goals.box_index] < 0.05 * world.body.cell_size
         stuck = (left[:, 0] < -0.02) & (np.hypot(*left.T) > self.config.tolerance) & resting
         return (goals.kind == GoalKind.PUSH) & ((left[:, 0] < -self.config.overshoot) | stuck) & ~completed
@@ -268,14 +268,13 @@ class GoalTask:
             row, seed, bool(world.solved[row]), float(world.episode_return[row]), int(world.steps[row])
         )
 
-    def _distance(self) -> NDArray[np.float64]:
+    def _distance(self, offsets: NDArray[np.float32]) -> NDArray[np.floating]:
         """Return the distance, beyond the tolerance, of what has to reach its target, in cells, [B]."""
-        offsets = goal_offsets(self.world)
         push = self.world.goals.kind == GoalKind.PUSH
         pair = np.where(push[:, None], offsets[:, 2:], offsets[:, :2])
         return np.hypot(pair[:, 0], pair[:, 1]) - self.config.tolerance
 
-    def _outcome(self, row: int, completed: bool, lying: bool) -> Outcome:
+    def _outcome(self, row: int, completed: bool, across: bool, lying: bool) -> Outcome:
         world, goals = self.world, self.world.goals
         kind, index = GoalKind(int(goals.kind[row])), int(goals.box_index[row])
         expected = self._start_boxes[row].copy()
@@ -283,14 +282,13 @@ class GoalTask:
             expected[index] += goals.goal_cell[row] - goals.origin_cell[row]
         astray = bool((world.box_cell[row] != expected).any())
         astray |= bool((world.agent_cell[row] != goals.goal_cell[row]).any()) and completed
-        across = abs(goal_offsets(world)[row, 3])
         return Outcome(
             row,
             kind,
             Instruction(int(goals.direction[row])),
             completed,
             int(self._noise.elapsed[row]),
-            kind == GoalKind.PUSH and bool(across > self.config.tolerance),
+            kind == GoalKind.PUSH and across,
             astray,
             lying,
         )

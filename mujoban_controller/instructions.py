@@ -133,7 +133,7 @@ class TerminationNoise:
         self._completed[rows] = 0
         self.elapsed[rows] = 0
 
-    def step(self, completed: NDArray[np.bool_], distance: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def step(self, completed: NDArray[np.bool_], distance: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return the signal after one tick, [B].
 
         Args:
