@@ -104,6 +104,7 @@ def test_difficulty_5_is_as_hard_as_boxoban():
     solutions = solve_batch(generate_batch(5, range(1000)), weight=2.0)
     standard_error = solutions.length.std() / np.sqrt(len(solutions.length))
     assert solutions.length.mean() > 32 - 2 * standard_error
+    assert solutions.length.mean() < 32 + 3 * standard_error
     assert abs(solutions.pushes.mean() - 13) < 1
 
 
