@@ -14,8 +14,12 @@ from bringup.graph_recorder import RecorderNode
 from bringup.parameters import graph_parameters, read_parameters, write_parameters
 from mujoban_controller import teacher_weights
 from mujoban_controller.node import ControllerNode
+from mujoban_core.plugins import ROLES
 from mujoban_estimator.estimator import StateEstimator
+from mujoban_estimator.node import EstimatorNode
+from mujoban_estimator.termination_node import TerminationNode
 from mujoban_planner.deliberation import Deliberation
+from mujoban_planner.node import PlannerNode
 from mujoban_rl.weights import save_weights
 from mujoban_sim.node import SimulatorNode
 from mujoban_sim.node_parameters import PARAMETERS
@@ -107,6 +111,27 @@ def test_a_search_ahead_gets_a_fifth_of_a_tick_of_real_time_and_a_number_of_eval
     thinking = Stack(deliberation=Deliberation(look_ahead=50), look_around=0)
     planner = play_graph(thinking, names=["planner"], realtime=speed).graph.nodes["planner"].module
     assert planner.deadline == pytest.approx(seconds)
+
+
+OTHER_THAN_A_NODE_ALONE = {(role, "body") for role in ROLES}
+"""Parameters of a graph whose nodes, started alone, do otherwise: with weights of whichever body."""
+
+
+@pytest.mark.parametrize(
+    "kind", [SimulatorNode, EstimatorNode, TerminationNode, PlannerNode, ControllerNode], ids=lambda kind: kind.__name__
+)
+@pytest.mark.usefixtures("ros")
+def test_the_parameter_file_names_what_nodes_do_by_default(kind):
+    node = kind()
+    try:
+        name = node.get_name()
+        named = read_parameters()[name]
+        default = {parameter: node.get_parameter(parameter).value for parameter in named}
+    finally:
+        node.destroy_node()
+    differing = {(name, parameter) for parameter, value in named.items() if value != default[parameter]}
+    assert differing == {which for which in OTHER_THAN_A_NODE_ALONE if which[0] == name}
+    assert all(type(value) is type(default[parameter]) for parameter, value in named.items())
 
 
 @pytest.mark.parametrize(
