@@ -14,45 +14,21 @@ if __name__ == "__main__":
 
     end_at_once()
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final, Literal
-
-import tyro
+from typing import Final
 
 from bringup import keep
-from bringup.options import Count, WorldOptions, whole
 from bringup.pipeline import Pipeline, Stage
 from bringup.training_display import run_shown
+from bringup.training_options import BAGS, PRODUCTS, WEIGHTS, Options
 from bringup.training_report import EVALUATIONS, write_report
-from bringup.training_seed import seed_of
-from bringup.training_sizes import Machine
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.program import read_options, run_command
-from mujoban_planner.seed_streams import LAST_SEED
 from mujoban_sokoban.generator import FRESH_SEEDS, SENSES_SEEDS, TRAIN_SEEDS
 
 PROG = "bringup.train_all"
-WEIGHTS: Final = {
-    "controller": "controller_mpo/controller.safetensors",
-    "planner": "planner/planner.safetensors",
-    "estimator": "estimator_second/weights/estimator.safetensors",
-    "termination": "estimator_second/weights/termination.safetensors",
-}
-"""Where in the run's directory the weights of each module stand."""
-PRODUCTS: Final = {
-    **WEIGHTS,
-    "teacher": "teacher/teacher.safetensors",
-    "critic": "teacher/critic.safetensors",
-    "student": "controller_distil/controller.safetensors",
-    "first": "bags_first",
-    "second": "bags_second",
-}
-"""And all that another stage needs: the teacher, its student, the bags."""
-_BAGS: Final = ("first", "second")
 _RECORDER: Final = "bringup.record"
 SHARES: Final = {
     "teacher": 0.09,
@@ -111,62 +87,6 @@ _LEVELS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
 _VALIDATION_PER_HOUR: Final = 6
 """Episodes of them, per hour of the whole run; at most 32."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Train all four modules from nothing."""
-
-    run: Path = Path("runs/all")
-    """Directory of everything; an existing one is resumed."""
-    hours: float = 8.0
-    """Time that the whole run may take on two cores; the budgets of all stages scale with it."""
-    before: Annotated[Path | None, tyro.conf.arg(name="continue")] = None
-    """Directory of a finished run: every module goes on from its weights, and learns also from its bags, if they are
-    still there."""
-    keep: tuple[Literal["controller", "planner", "senses"], ...] = ()
-    """Modules that stay what they are there; bags are recorded for the senses alone."""
-    physics: Annotated[WorldOptions, tyro.conf.arg(name="")] = field(default_factory=WorldOptions)
-    seed: Annotated[int | None, whole("N", 0)] = None
-    """Decides levels and weights; by default 0, or one more than that of the run that is gone on from."""
-    cores: Count = 2
-    device: str = "cpu"
-    """Device on which networks learn. A GPU has larger batches, a larger planner, and its time by the clock."""
-    evaluation_episodes: Count = 128
-    """Validation levels that each table of the report counts."""
-
-    def __post_init__(self) -> None:
-        """Reject times in which nothing can be learned, and seeds past those for training."""
-        if not 0 < self.hours < math.inf:
-            raise ValueError(f"--hours {self.hours}: expected a positive number")
-        if not 0 <= self.stream <= LAST_SEED:
-            raise ValueError(f"--seed {self.stream}: expected a whole number from 0 to {LAST_SEED}")
-        if self.keep and self.before is None:
-            raise ValueError(f"--keep {' '.join(self.keep)}: expected --continue, which says whose are kept")
-        spared = _BAGS if self.has_critic else (*_BAGS, "critic")
-        needed = (path for name, path in PRODUCTS.items() if name not in spared)
-        missing = [] if self.before is None else [path for path in needed if not (self.before / path).exists()]
-        if missing:
-            raise ValueError(f"--continue {self.before}: lacks {missing[0]}, expected the directory of a finished run")
-        if self.before is not None and self.seed is not None and self.seed == seed_of(self.before):
-            raise ValueError(f"--seed {self.stream}: the levels of {self.before} again, expected another seed")
-
-    @cached_property
-    def stream(self) -> int:
-        """The seed of all stages."""
-        if self.seed is not None:
-            return self.seed
-        return 0 if self.before is None else seed_of(self.before) + 1
-
-    @property
-    def has_critic(self) -> bool:
-        """Whether the teacher leaves a critic beside it: whether it learns by MPO."""
-        return get_body(self.physics.body).turn is not None
-
-    @property
-    def machine(self) -> Machine:
-        """What trains."""
-        return Machine(self.cores, self.device)
 
 
 def stages(options: Options) -> list[Stage]:
@@ -296,7 +216,7 @@ def _senses(options: Options) -> list[Stage]:
     bags = list[Path]()
     start = first = None if options.before is None else (options.before / PRODUCTS["estimator"]).parent
     needs = [validation.name]
-    for round_ in _BAGS:
+    for round_ in BAGS:
         recording = f"bags_{round_}"
         found.append(_recording(options, recording))
         bags.append(options.run / recording)
@@ -323,7 +243,7 @@ def _earlier_bags(options: Options, name: str) -> list[Path]:
     """Return the bags of the run that is gone on from which a stage reads: those that there are, or were for it."""
     if options.before is None:
         return []
-    folders = [options.before / PRODUCTS[round_] for round_ in _BAGS]
+    folders = [options.before / PRODUCTS[round_] for round_ in BAGS]
     entry = Pipeline.read(options.run).entries.get(name)
     if entry is not None and entry.done:
         return [folder for folder in folders if str(folder) in entry.command]
