@@ -66,12 +66,12 @@ class TerminationNode(ModuleNode[Termination]):
         return super().initial_state(number), np.zeros(1, np.bool_)
 
     def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:
-        """Wait for A_{t-1}, unless this node has only just joined the episode."""
+        """Wait for A_{t-1}, unless this node has not answered the tick before: then it may have missed it."""
         if episode.step == 0:
             # What was said before is of another episode, or of a simulator that ran before this one.
             self._said.clear()
-        joined = self.state is not None and episode.step > 0
-        if joined and not insist and stamp - topics.TICK not in self._said:
+        follows = self.state is not None and episode.step > 0 and self._handled == stamp - topics.TICK
+        if follows and not insist and stamp - topics.TICK not in self._said:
             return None
         return super().answer(stamp, episode, inputs, insist=insist)
 

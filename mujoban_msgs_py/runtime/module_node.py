@@ -162,6 +162,11 @@ class ModuleNode(TickNode, Generic[ModuleT]):
             self.begin(episode, inputs)
         return self.step(episode, inputs, _ground_truth(inputs) if self._truth else None)
 
+    def start_anew(self) -> None:
+        """Forget the state as well, which is of another world."""
+        super().start_anew()
+        self.state = None
+
     def keep(self, stamp: int, outputs: Sequence[Output]) -> None:
         """Keep the answer and the state for the process that comes after this one."""
         if self._kept is None or self.state is None:

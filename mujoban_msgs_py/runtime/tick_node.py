@@ -52,6 +52,9 @@ _DEADLINE = 3600.0
 PATIENCE = 60
 """Repeated offers of a tick after which a node answers without what it still waits for: one that was killed is back by
 then, and has said it."""
+_JUMP = 3
+"""Offers of one tick below those that were answered, with none of these between them, that say that time has jumped
+back: a simulator repeats a tick only while it waits for an answer."""
 
 _USAGE = "--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO, as every node of ROS takes them"
 
@@ -85,6 +88,8 @@ class TickNode(GraphNode):
         self._outputs: Sequence[Output] = ()
         self._open: tuple[int, dict[str, Any]] | None = None
         self._offers = 0
+        self._behind = (-1, 0)
+        """Stamp of the latest offer, if it was below what was answered, and how often in a row it came."""
         self._answered = 0
         self._reported = (0, time.monotonic())
 
@@ -141,6 +146,10 @@ class TickNode(GraphNode):
         self._handled, self._outputs = stamp, outputs
         self._publish()
 
+    def start_anew(self) -> None:
+        """Forget what was answered and is open: time has jumped back."""
+        self._handled, self._open, self._behind = -1, None, (-1, 0)
+
     def retry(self) -> None:
         """Ask `answer` again about the tick that it could not answer yet."""
         if self._open is None or self.ended:
@@ -185,6 +194,8 @@ class TickNode(GraphNode):
             self.retry()
 
     def _note_offer(self, stamp: int, episode: Episode) -> None:
+        before, times = self._behind
+        self._behind = (stamp, times + 1 if stamp == before else 1) if stamp < self._handled else (-1, 0)
         if stamp == self._handled and (self._outputs or episode.ended):
             self._publish()
         elif stamp == self._handled:
@@ -193,11 +204,11 @@ class TickNode(GraphNode):
                 self.get_logger().error(f"{EPISODE.name} contradicts itself at {stamp} ns: two simulators?")
             self.counts["contradictory episodes"] += 1
             self._handled = stamp - 1
-        elif stamp < self._handled and episode.step == 0:
-            # Time has jumped back: another simulator, or a bag that is played from its start.
+        elif stamp < self._handled and (episode.step == 0 or self._behind[1] >= _JUMP):
+            # Another simulator, or one that another was ahead of, or a bag that is played from its start.
             if is_due(self, "jump back"):
                 self.get_logger().warning("simulated time jumped back: starting anew")
-            self._handled, self._open = -1, None
+            self.start_anew()
         elif self._open is not None and stamp == self._open[0]:
             self._offers += 1
             self.retry()

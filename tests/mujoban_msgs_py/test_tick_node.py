@@ -7,7 +7,7 @@ from rclpy.serialization import serialize_message
 
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.arrivals import Serialised
-from mujoban_msgs_py.runtime.tick_node import PATIENCE, TickNode, run_node
+from mujoban_msgs_py.runtime.tick_node import PATIENCE, Output, TickNode, run_node
 
 
 class Waiting(TickNode):
@@ -29,6 +29,25 @@ class Waiting(TickNode):
         pose = PoseStamped(header=header)
         for topic, message in ((topics.EPISODE, Episode(header=header, episode=1, step=tick)), (topics.POSE, pose)):
             self._receive(topic, None, Serialised(serialize_message(message), topic.type))
+
+
+class Prompt(Waiting):
+    """Answers every tick at once, with something."""
+
+    def __init__(self):
+        super().__init__()
+        self.output = self.create_output(topics.TRUE_POSE)
+
+    def answer(self, stamp, episode, inputs, *, insist):
+        super().answer(stamp, episode, inputs, insist=True)
+        return [Output(self.output, inputs[topics.POSE.name])]
+
+
+@pytest.fixture
+def prompt(ros):
+    node = Prompt()
+    yield node
+    node.destroy_node()
 
 
 @pytest.fixture
@@ -57,3 +76,14 @@ def test_where_time_goes_on_the_next_tick_does_not_wait_as_well(waiting):
     waiting.offer(5)
     waiting.offer(6)
     assert waiting.answered == [6]
+
+
+def test_a_simulator_that_another_was_ahead_of_is_answered_once_it_alone_asks(prompt):
+    for tick in (49, 150):
+        prompt.offer(tick)
+    for tick in (50, 50, 150, 50, 50, 150):  # the other is there still
+        prompt.offer(tick)
+    assert prompt.answered == [49, 150]
+    for tick in (50, 50, 50, 51):
+        prompt.offer(tick)
+    assert prompt.answered == [49, 150, 50, 51]

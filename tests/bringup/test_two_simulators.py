@@ -1,0 +1,46 @@
+"""A second simulator comes into a graph and goes: the first one's run goes on without it."""
+
+import pytest
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool
+
+from mujoban_sim.node import SimulatorNode
+from mujoban_sokoban.episodes import Episodes
+
+
+@pytest.fixture
+def add_simulator():
+    """Return a function that adds a simulator, with parameters, to a graph."""
+
+    def add(graph, **parameters):
+        values = {"difficulty": 1, "seed": 3, "resend_after": 0.1, **parameters}
+        overrides = [Parameter(name, value=value) for name, value in values.items()]
+        return graph.graph.add(SimulatorNode(parameter_overrides=overrides, intra_process=graph.graph.intra_process))
+
+    return add
+
+
+def test_a_simulator_whose_time_another_was_ahead_of_goes_on_in_mid_episode(play_graph, add_simulator):
+    graph = play_graph(episodes=Episodes(1, 5, difficulty=2), resend_after=0.1)
+    graph.spin_until(lambda: graph.simulator.ticks >= 10)
+    graph.call(SetBool, "/pause", SetBool.Request(data=True))
+    held = graph.simulator.ticks
+    second = add_simulator(graph)
+    graph.spin_until(lambda: second.ticks >= held + 10)
+    graph.graph.end(second)
+    graph.call(SetBool, "/pause", SetBool.Request(data=False))
+    graph.spin_until(lambda: graph.simulator.ticks >= held + 10)
+    assert graph.simulator.counts["repeated ticks"] < 30, "a module waits for what was said to the other one"
+
+
+def test_a_simulator_does_not_stall_for_what_another_made_the_modules_forget(play_graph, add_simulator):
+    graph = play_graph(episodes=Episodes(1, 5, difficulty=2), resend_after=0.1)
+    graph.spin_until(lambda: graph.simulator.ticks >= 30)
+    graph.call(SetBool, "/pause", SetBool.Request(data=True))
+    held = graph.simulator.ticks
+    second = add_simulator(graph)
+    graph.spin_until(lambda: second.ticks >= 3)
+    graph.graph.end(second)
+    graph.call(SetBool, "/pause", SetBool.Request(data=False))
+    graph.spin_until(lambda: graph.simulator.ticks >= held + 10)
+    assert graph.simulator.counts["repeated ticks"] < 30, "a module waits for what was said to the other one"
