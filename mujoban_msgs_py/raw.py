@@ -51,6 +51,8 @@ def read(message: bytes, kind: type[Message], decode: Callable[[Any], Any] | Non
         ValueError: If the bytes are not a message of this type.
     """
     try:
+        if message[1:2] > bytes([_LITTLE_ENDIAN]):  # other kinds of CDR, which rclpy reads and readers of bags do not
+            raise RuntimeError
         content = deserialize_message(message, kind)
     except RuntimeError:
         name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"

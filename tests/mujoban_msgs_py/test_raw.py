@@ -4,7 +4,7 @@ from mujoban_msgs.msg import AbstractState
 from rclpy.serialization import serialize_message
 
 from mujoban_msgs_py import conversions
-from mujoban_msgs_py.raw import Steady
+from mujoban_msgs_py.raw import Steady, read
 
 
 def state(tick, box=None):
@@ -37,3 +37,11 @@ def test_a_steady_topic_refuses_what_is_no_message_and_reads_on():
     with pytest.raises(ValueError, match="no serialised mujoban_msgs/msg/AbstractState"):
         reader(state(1)[:40])
     assert reader(state(2, (1, 2)))[1, 2, 3] == 1.0
+
+
+@pytest.mark.parametrize("kind", [2, 7, 10])
+def test_a_kind_of_cdr_that_no_bag_can_be_read_with_is_no_message(kind):
+    message = state(0)
+    assert read(message, AbstractState) is not None
+    with pytest.raises(ValueError, match="no serialised mujoban_msgs/msg/AbstractState"):
+        read(message[:1] + bytes([kind]) + message[2:], AbstractState)
