@@ -42,6 +42,7 @@ from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.discovery import chosen_domain, confine_discovery
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.intra_process import TopicPublisher
+from mujoban_msgs_py.runtime.jumps import Jumps
 from mujoban_msgs_py.runtime.shared_memory import mapped_segments, release_segments
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.synchroniser import Synchroniser
@@ -52,9 +53,6 @@ _DEADLINE = 3600.0
 PATIENCE = 60
 """Repeated offers of a tick after which a node answers without what it still waits for: one that was killed is back by
 then, and has said it."""
-_JUMP = 3
-"""Offers of one tick below those that were answered, with none of these between them, that say that time has jumped
-back: a simulator repeats a tick only while it waits for an answer."""
 
 _USAGE = "--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO, as every node of ROS takes them"
 
@@ -88,8 +86,7 @@ class TickNode(GraphNode):
         self._outputs: Sequence[Output] = ()
         self._open: tuple[int, dict[str, Any]] | None = None
         self._offers = 0
-        self._behind = (-1, 0)
-        """Stamp of the latest offer, if it was below what was answered, and how often in a row it came."""
+        self._jumps = Jumps()
         self._answered = 0
         self._reported = (0, time.monotonic())
 
@@ -148,7 +145,7 @@ class TickNode(GraphNode):
 
     def start_anew(self) -> None:
         """Forget what was answered and is open: time has jumped back."""
-        self._handled, self._open, self._behind = -1, None, (-1, 0)
+        self._handled, self._open = -1, None
 
     def retry(self) -> None:
         """Ask `answer` again about the tick that it could not answer yet."""
@@ -194,8 +191,7 @@ class TickNode(GraphNode):
             self.retry()
 
     def _note_offer(self, stamp: int, episode: Episode) -> None:
-        before, times = self._behind
-        self._behind = (stamp, times + 1 if stamp == before else 1) if stamp < self._handled else (-1, 0)
+        jumped = self._jumps.note(stamp, episode.step, self._handled)
         if stamp == self._handled and (self._outputs or episode.ended):
             self._publish()
         elif stamp == self._handled:
@@ -204,8 +200,7 @@ class TickNode(GraphNode):
                 self.get_logger().error(f"{EPISODE.name} contradicts itself at {stamp} ns: two simulators?")
             self.counts["contradictory episodes"] += 1
             self._handled = stamp - 1
-        elif stamp < self._handled and (episode.step == 0 or self._behind[1] >= _JUMP):
-            # Another simulator, or one that another was ahead of, or a bag that is played from its start.
+        elif jumped:
             if is_due(self, "jump back"):
                 self.get_logger().warning("simulated time jumped back: starting anew")
             self.start_anew()
