@@ -15,7 +15,9 @@ from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import RclpyOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.graph_node import GraphNode
+from mujoban_msgs_py.runtime.jumps import Jumps
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
+from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
 
 HELD_TICKS = 40
@@ -31,6 +33,7 @@ class RecorderNode(GraphNode):
     A tick is written when all its topics have arrived; then `/recorded` says so. A simulator that awaits this in
     lockstep loses nothing. In real time a tick is written as it is when it has become too old, and what it lacks is
     counted. Repeated messages are written once. What it records goes through the middleware: a bag holds what is sent.
+    Where simulated time jumps back, as with a second simulator, the next file of the bag begins.
 
     Parameters:
         path: Folder of the bag, which must not exist yet.
@@ -70,6 +73,9 @@ class RecorderNode(GraphNode):
         )  # fmt: skip
         self._ticks: dict[int, dict[str, bytes]] = {}
         self._last_ticks: set[int] = set()
+        self._jumps = Jumps()
+        self._behind: tuple[int, dict[str, bytes]] = (-1, {})
+        """Stamp and messages of the latest tick that came though later ones are in the bag."""
         self.written = 0
         self._acknowledge = self.create_output(RECORDED)
         for topic in GRAPH_TOPICS.values():
@@ -84,17 +90,35 @@ class RecorderNode(GraphNode):
 
     def _receiver(self, name: str) -> Callable[[Received], None]:
         def receive(message: Received) -> None:
-            stamp = message.stamp
+            stamp, is_episode = message.stamp, name == topics.EPISODE.name
+            if is_episode and self._jumps.note(stamp, message.content.step, self.written):
+                self._start_anew(stamp)
             if stamp > self.written:
                 self._ticks.setdefault(stamp, {}).setdefault(name, message.raw)
-                if name == topics.EPISODE.name and message.content.ended:
+                if is_episode and message.content.ended:
                     self._last_ticks.add(stamp)
                 self._write_if_complete(stamp)
-            elif name == topics.EPISODE.name:
+                return
+            if stamp != self._behind[0]:
+                self._behind = (stamp, {})
+            self._behind[1].setdefault(name, message.raw)
+            if is_episode and stamp == self.written:
                 # The simulator offers a tick again that is in the bag: it has missed our word.
                 self._confirm(stamp)
 
         return receive
+
+    def _start_anew(self, stamp: int) -> None:
+        """Go on with a tick [ns] of the past, of which something may have come before it was known for one."""
+        self.counts["jumps back of time"] += 1
+        if is_due(self, "jump back"):
+            self.get_logger().warning("simulated time jumped back: what follows goes into another file of the bag")
+        self._flush(before=None)
+        self._bag.split()
+        self.written = 0
+        if stamp == self._behind[0]:
+            self._ticks[stamp] = self._behind[1]
+        self._behind = (-1, {})
 
     def _missing(self, stamp: int) -> list[str]:
         expected = SIMULATOR_TOPICS if stamp in self._last_ticks else (*SIMULATOR_TOPICS, *self._answers)
