@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from mujoban_core.interfaces import (
     TerminationOutput,
     TerminationState,
 )
+from mujoban_core.trees import map_leaves
 
 _SEEING: Final = ("estimator", "termination", "controller")
 """Roles that look at frames, or at the ground truth in their place; a planner sees estimates alone."""
@@ -91,21 +92,24 @@ class SensePlanAct:
         """Return None: the estimator looks in every tick."""
 
     def step(self, obs: Observation, truth: GroundTruth, state: PolicyState) -> tuple[Decision, PolicyState]:
-        """Return the decision of tick t and the next state; `truth` reaches privileged modules only."""
+        """Return the decision of tick t and the next state; `truth` reaches privileged modules only.
+
+        What is seen or estimated each module gets as arrays of its own, which it may write into.
+        """
         estimate, estimator_state = self.estimator.step(
-            EstimatorInput(obs.frame, obs.pose, self._truth_for("estimator", truth)), state.estimator
+            EstimatorInput(obs.frame.copy(), obs.pose.copy(), self._truth_for("estimator", truth)), state.estimator
         )
         previous = np.where(state.planner.instruction < 0, NO_INSTRUCTION, state.planner.instruction)
         beta, termination_state = self.termination.step(
             TerminationInput(
-                obs.frame, obs.proprio, previous, state.terminated, self._truth_for("termination", truth)
+                obs.frame.copy(), obs.proprio.copy(), previous, state.terminated, self._truth_for("termination", truth)
             ),
             state.termination,
         )
-        instruction, planner_state = self.planner.step(estimate, beta.terminated, state.planner)
+        instruction, planner_state = self.planner.step(estimate.copy(), beta.terminated, state.planner)
         torque, controller_state = self.controller.step(
             ControllerInput(
-                instruction, obs.frame, obs.proprio, beta.terminated, self._truth_for("controller", truth)
+                instruction, obs.frame.copy(), obs.proprio.copy(), beta.terminated, self._truth_for("controller", truth)
             ),
             state.controller,
         )
@@ -116,4 +120,8 @@ class SensePlanAct:
         )
 
     def _truth_for(self, role: str, truth: GroundTruth) -> GroundTruth | None:
-        return truth if role in self.told else None
+        return map_leaves(_copied, truth) if role in self.told else None
+
+
+def _copied(array: NDArray[Any] | None) -> NDArray[Any] | None:
+    return None if array is None else array.copy()

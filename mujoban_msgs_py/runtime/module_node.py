@@ -160,6 +160,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         if self.state is None or episode.episode != self._episode or episode.step == 0:
             self._episode = episode.episode
             self.begin(episode, inputs)
+        inputs = _own(inputs)
         return self.step(episode, inputs, _ground_truth(inputs) if self._truth else None)
 
     def start_anew(self) -> None:
@@ -233,6 +234,14 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         self.counts["reloads"] += 1
         self.get_logger().info(f"loaded {weights or 'the weights that ship'} on {device}")
         return SetParametersResult(successful=True)
+
+
+def _own(inputs: dict[str, Any]) -> dict[str, Any]:
+    """Return inputs that the module may write into: the arrays are shared with the other nodes of the process.
+
+    Arrays that cannot be written into would spare 1 us each, but PyTorch warns of them, and Numba compiles anew.
+    """
+    return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in inputs.items()}
 
 
 def _ground_truth(inputs: dict[str, Any]) -> GroundTruth:
