@@ -153,7 +153,7 @@ class SimulatorNode(GraphNode):
     def _start_when_complete(self) -> None:
         """Begin once the modules listen and answer, and the witnesses as well."""
         needed = (topics.TORQUE, *[topics.INSTRUCTION] * self._settings["instructed"], *self._witnesses)
-        answering = all(self.count_publishers(topic.name) for topic in needed)
+        answering = all(self.count_publishers(self.resolve_topic_name(topic.name)) for topic in needed)
         if not (answering and self._observation.matched(everything=topics.RECORDED in self._witnesses)):
             return
         self._start_timer.cancel()

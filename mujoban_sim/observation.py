@@ -73,7 +73,7 @@ class ObservationPublisher:
             self._top_readers = 0  # whoever comes next may want more
             return False
         if readers != self._top_readers:
-            known = self._node.get_subscriptions_info_by_topic(topic.name)
+            known = self._node.get_subscriptions_info_by_topic(self._node.resolve_topic_name(topic.name))
             # Not all may be known yet: then they are looked at again in the next tick.
             self._top_readers = len(known)
             glances = all(info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in known)
