@@ -328,6 +328,8 @@ class SimulatorNode(GraphNode):
         rate = self.ticks / self.seconds if self.seconds else 0.0
         values = {"ticks": self.ticks, "ticks/s": f"{rate:.1f}", "answer ms, p99": f"{self.pace.answer_ms(99):.1f}"}
         values |= {"episode": self._place.starts, **self.counts}
+        if self.finished.done():
+            return Condition("finished", values)
         if self._started is None:
             return Condition("waiting for the graph to be complete", values)
         if not self.pace.kept:
@@ -359,17 +361,28 @@ class SimulatorNode(GraphNode):
         return response
 
     def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._paused
-        response.message = "one tick" if self._paused else "not paused: call /pause first"
-        if self._paused:
+        response.success = self._paused and not self.finished.done()
+        if self.finished.done():
+            response.message = "no episode is running"
+        else:
+            response.message = "one tick" if self._paused else "not paused: call /pause first"
+        if response.success:
             self._steps_due += 1
             self._proceed()
         return response
 
 
+class _OwnProcess(SimulatorNode):
+    # Beside a monitor that shows results the line would only disturb.
+    def _end(self) -> None:
+        super()._end()
+        if self.finished.done():
+            self.get_logger().info(f"all episodes have been played: {len(self.episodes)}")
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node; without OpenGL it ends with one line on stderr and status 2, as for other bad input."""
-    return run_node(SimulatorNode, args)
+    return run_node(_OwnProcess, args)
 
 
 if __name__ == "__main__":

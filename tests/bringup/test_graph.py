@@ -152,7 +152,7 @@ def test_a_file_that_a_node_has_not_kept_is_named(play_graph, tmp_path, name, da
 
 
 def test_every_node_says_on_diagnostics_how_it_is(play_graph):
-    graph = play_graph(time_limit=4000)
+    graph = play_graph(episodes=Episodes(99, 47, difficulty=2), time_limit=4000)
     heard = {}
     graph.tap.create_subscription(
         DiagnosticArray, "/diagnostics", lambda message: heard.update({s.name: s for s in message.status}), 10
