@@ -106,9 +106,16 @@ def test_the_installed_commands_are_the_programs(name, monkeypatch, capfd):
     assert left.value.code == 0 and f"mujoban-{name}" in capfd.readouterr().out
 
 
-@pytest.mark.parametrize("program", ["bringup.run_stack", "bringup.record", "mujoban_planner.train"])
-def test_a_ctrl_c_while_a_program_is_still_being_imported_leaves_no_traceback(program, tmp_path):
-    (tmp_path / "tyro.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(9)\n")
+@pytest.mark.parametrize(
+    ("program", "imported"),
+    [
+        *((program, "tyro") for program in ("bringup.run_stack", "bringup.record", "mujoban_planner.train")),
+        *((program, "rclpy") for program in ("mujoban_sim.node", "bringup.graph_recorder", "mujoban_planner.node")),
+    ],
+)
+def test_a_ctrl_c_while_a_program_is_still_being_imported_leaves_no_traceback(program, imported, tmp_path):
+    early = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(9)\n"
+    (tmp_path / f"{imported}.py").write_text(early)
     done = subprocess.run(
         [sys.executable, "-m", program],
         cwd=Path(run_stack.__file__).parents[1],
