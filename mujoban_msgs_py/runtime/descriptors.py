@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, TypedDict, TypeVar, cast
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -70,3 +71,16 @@ def declare_run(node: Node, default: int = ANY) -> int:
     """
     about = described("identifier of the run; -1: of any", fixed=True, low=min(default, 0), high=TICK - 1)
     return declare(node, "run", default, about)
+
+
+def warn_of_unknown(node: Node) -> None:
+    """Have a node that is made warn of parameters that it was given and has not, with the names that are near.
+
+    They are not refused: a file may have some for all nodes (`/**`).
+    """
+    given: dict[str, Parameter] = node._parameter_overrides  # rclpy tells them nowhere else
+    known = [*node._parameters]
+    # Those that begin so are of rclpy itself, which reads them where it makes publishers and subscriptions.
+    for name in sorted(name for name in given if name not in known and not name.startswith("qos_overrides.")):
+        near = get_close_matches(name, known, 3) or known
+        node.get_logger().warning(f"no parameter {name} of this node, which ignores it: expected {' or '.join(near)}")

@@ -37,7 +37,7 @@ from mujoban_msgs_py.arrivals import Arrival
 from mujoban_msgs_py.decoders import DECODERS, checked
 from mujoban_msgs_py.listening import belongs, reject, subscribe
 from mujoban_msgs_py.run_identifier import ANY
-from mujoban_msgs_py.runtime.descriptors import NodeOptions
+from mujoban_msgs_py.runtime.descriptors import NodeOptions, warn_of_unknown
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
 from mujoban_msgs_py.runtime.discovery import chosen_domain, confine_discovery
 from mujoban_msgs_py.runtime.graph_node import GraphNode
@@ -303,7 +303,7 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     end_with_parent()
     try:
         # Of the process's own the first is its name.
-        given = remove_ros_args(args)[args is None :]
+        given = _without_ros_args(args)[args is None :]
         if {"-h", "--help"} & {*given}:
             print(inspect.getdoc(make) or "", f"Arguments: {_USAGE}", sep="\n\n")
             return 0
@@ -319,8 +319,18 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
     return 0
 
 
+def _without_ros_args(args: Sequence[str] | None) -> Sequence[str]:
+    """Return what no argument of ROS is; those that are none, and files that they name, are a ValueError."""
+    try:
+        return remove_ros_args(args)
+    except RuntimeError as error:  # of rcl's parser: it names the argument, and then lines of its own source
+        said = re.sub(r", at \S+:\d+", "", str(error)).removeprefix("Failed to parse ROS arguments: ")
+        raise ValueError(f"bad ROS arguments: {said}, expected {_USAGE}") from None
+
+
 def _run(make: Callable[[], Node], stop: StopSignal) -> None:
     node = make()
+    warn_of_unknown(node)
     stop.deferred = True
     try:
         executor = EventsExecutor()
