@@ -26,18 +26,18 @@ from mujoban_msgs_py.checks import ConversionError
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run
 from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
+from mujoban_msgs_py.runtime.discovery import lock_domain
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.kept import KeptArrays
 from mujoban_msgs_py.runtime.pace import Pace
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.topics import TICK, Topic
-from mujoban_sim.node_parameters import PARAMETERS
+from mujoban_sim.node_parameters import PARAMETERS, episodes_of
 from mujoban_sim.observation import ObservationPublisher
 from mujoban_sim.resume import Moment, Place
 from mujoban_sim.tick_messages import TickLabel
 from mujoban_sim.world import World
-from mujoban_sokoban.episodes import Episodes
 
 MATCH_PERIOD = 0.02
 """Seconds between two looks at whether the graph is complete."""
@@ -86,7 +86,7 @@ class SimulatorNode(GraphNode):
         self.finished, self.ticks = Future(), 0
         self._settings: dict[str, Any] = {name: declare(self, name, *about) for name, about in PARAMETERS.items()}
         self.run = declare_run(self, 0)
-        self.episodes = self._read_episodes()
+        self.episodes = episodes_of(self._settings)
         self.world = World(
             1,
             body=self._settings["body"],
@@ -133,15 +133,6 @@ class SimulatorNode(GraphNode):
     def seconds(self) -> float:
         """Wall time since the first tick."""
         return 0.0 if self._started is None else time.perf_counter() - self._started
-
-    def _read_episodes(self) -> Episodes:
-        level_file, seed = self._settings["level_file"], self._settings["seed"]
-        return Episodes(
-            self._settings["episodes"] or None,
-            None if seed < 0 else seed,
-            difficulty=self._settings["difficulty"],
-            level_file=Path(level_file) if level_file else None,
-        )
 
     def _listen(self) -> None:
         listen(self, topics.TORQUE, self._on_torque, otherwise=self._no_torque)
@@ -378,10 +369,19 @@ class SimulatorNode(GraphNode):
 
 
 class _OwnProcess(SimulatorNode):
-    # Beside a monitor that shows results the line would only disturb.
+    def __init__(self, **options: Unpack[NodeOptions]) -> None:
+        super().__init__(**options)
+        # A graph that is started later takes another domain; one that has started this process holds it already.
+        self._domain = lock_domain(self.context.get_domain_id())
+
+    def destroy_node(self) -> None:
+        if self._domain is not None:
+            self._domain.close()
+        super().destroy_node()
+
     def _end(self) -> None:
         super()._end()
-        if self.finished.done():
+        if self.finished.done():  # in one process with a monitor, which shows results, the line would only disturb
             self.get_logger().info(f"all episodes have been played: {len(self.episodes)}")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -10,6 +12,7 @@ from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.grid import DIFFICULTIES, FASTEST
 from mujoban_msgs_py.runtime.descriptors import described
 from mujoban_sim.presets import DEFAULT_WORLD, WORLDS
+from mujoban_sokoban.episodes import Episodes
 
 LARGEST_PICTURE: Final = 4096
 """Most pixels along its edge."""
@@ -40,3 +43,14 @@ PARAMETERS: Final[dict[str, tuple[Any, ParameterDescriptor]]] = {
     "resume_file": ("", _setting("file of every tick that is offered, to go on from after a crash; empty: none")),
 }
 """Parameters of the simulator: their defaults, and what `ros2 param describe` says of them."""
+
+
+def episodes_of(settings: Mapping[str, Any]) -> Episodes:
+    """Return the episodes that parameters name; what is wrong with a level file is a ValueError or OSError."""
+    level_file, seed = settings["level_file"], settings["seed"]
+    return Episodes(
+        settings["episodes"] or None,
+        None if seed < 0 else seed,
+        difficulty=settings["difficulty"],
+        level_file=Path(level_file) if level_file else None,
+    )

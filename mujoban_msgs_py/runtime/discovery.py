@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import socket
 from pathlib import Path
 from typing import Final
 
@@ -49,3 +51,20 @@ def confine_discovery() -> None:
         os.environ[PROFILES] = str(LOOPBACK)
     # To Fast DDS, the system's default is what the profile says; `LOCALHOST` would add transports of its own to it.
     os.environ[RANGE] = "SYSTEM_DEFAULT" if ours else "LOCALHOST"
+
+
+def lock_domain(domain: int) -> socket.socket | None:
+    """Return what holds a domain until it is closed, or None if another process holds it.
+
+    It is a socket's name in Linux's abstract namespace: one for all users of a machine, in no folder, and free as soon
+    as the process that holds it has ended.
+    """
+    holder = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        holder.bind(f"\0mujoban-ros-domain-{domain}")
+    except OSError as error:
+        holder.close()
+        if error.errno == errno.EADDRINUSE:
+            return None
+        raise
+    return holder

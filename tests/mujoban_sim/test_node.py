@@ -4,6 +4,7 @@ import pytest
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
+from mujoban_msgs_py.runtime.discovery import lock_domain
 from mujoban_sim import node as program
 
 
@@ -28,3 +29,12 @@ def test_a_simulator_that_has_played_all_episodes_says_so_once_and_takes_no_step
     simulator._on_pause(SetBool.Request(data=True), SetBool.Response())
     answer = simulator._on_step(Trigger.Request(), Trigger.Response())
     assert not answer.success and answer.message == "no episode is running"
+
+
+def test_a_simulator_that_was_started_alone_holds_its_domain_until_it_ends(simulator):
+    domain = simulator.context.get_domain_id()
+    assert lock_domain(domain) is None
+    simulator.destroy_node()
+    lock = lock_domain(domain)
+    assert lock is not None
+    lock.close()
