@@ -85,6 +85,8 @@ def frame_from_msg(message: Image, size: int | None = FRAME_SIZE) -> NDArray[np.
     height, width, step = message.height, message.width, message.step
     if size is not None and (height, width) != (size, size):
         raise ConversionError(f"image must be {size}x{size} pixels, got {width}x{height}")
+    if not (height and width):
+        raise ConversionError(f"image must have a pixel or more, got {width}x{height}")
     data = np.frombuffer(message.data, np.uint8)
     if step < 3 * width or data.size != step * height:
         raise ConversionError(

@@ -10,7 +10,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from mujoban_msgs_py import conversions as c
 from mujoban_msgs_py.bags import TypeRegistry
 from mujoban_msgs_py.checks import ConversionError
-from mujoban_msgs_py.topics import GRAPH_TOPICS
+from mujoban_msgs_py.decoders import DECODERS
+from mujoban_msgs_py.topics import GRAPH_TOPICS, TOP_CAMERA
 
 HEADER = c.header(7_050_000_000, "map")
 TYPES = TypeRegistry()
@@ -48,6 +49,13 @@ def test_frames_round_trip(frame):
 def test_frames_need_not_be_contiguous():
     frame = np.arange(64 * 64 * 3, dtype=np.uint8).reshape(64, 64, 3)[::-1, ::-1]
     assert_round_trip(c.frame_to_msg(HEADER, frame), c.frame_from_msg, frame)
+
+
+@pytest.mark.parametrize("shape", [(0, 0, 3), (4, 0, 3), (0, 4, 3)])
+def test_an_image_without_a_pixel_is_refused_also_where_any_size_will_do(shape):
+    message = c.frame_to_msg(HEADER, np.zeros(shape, np.uint8))
+    with pytest.raises(ConversionError, match="image must have a pixel or more, got"):
+        DECODERS[TOP_CAMERA](message)
 
 
 def test_frames_with_padded_rows_are_read():
