@@ -77,6 +77,8 @@ class VizNode(GraphNode):
         self._wall_height = get_world(world).drawn_wall_height
         self.counts: Counter[str] = Counter()
         self._pose: Pose | None = None
+        self._posed = -1
+        """Stamp of the latest pose [ns]."""
         self._boxes: list[Pose] = []
         self._grids = {
             (source, name): self.create_publisher(OccupancyGrid, f"{PREFIX}/{source}/{name}", 1)
@@ -110,8 +112,9 @@ class VizNode(GraphNode):
         self._tf_static.publish(TFMessage(transforms=camera_transforms(self._body)))
 
     def _on_pose(self, message: Received) -> None:
-        self._pose = message.content.pose
-        if self._tf is not None:
+        self._pose, before, self._posed = message.content.pose, self._posed, message.stamp
+        # A tick that is offered again would have those who keep transforms complain of old data.
+        if self._tf is not None and message.stamp != before:
             transform = robot_transform(message.content.header.stamp, message.content.pose)
             self._tf.publish(self._make_tf(transforms=[transform]))
 

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,7 +14,8 @@ from bringup import viz
 from bringup.frames import camera_transforms, robot_description, robot_transform
 from mujoban_core.bodies import BALL
 from mujoban_core.camera import camera_extrinsics
-from mujoban_msgs_py import conversions
+from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py.listening import Received
 
 CONFIG = Path(viz.__file__).parent / "config"
 
@@ -57,3 +59,13 @@ def test_layouts_name_topics_that_there_are():
     known = {"/camera/image_raw", "/robot_description", "/viz/scene"}
     known |= {f"/viz/{source}/{layer}" for source in ("estimate", "ground_truth") for layer in viz.CHANNELS}
     assert shown <= known and len(shown) >= 5
+
+
+def test_a_tick_that_is_offered_again_is_no_new_transform(ros):
+    node, sent = viz.VizNode(), []
+    node._tf, node._make_tf = SimpleNamespace(publish=sent.append), SimpleNamespace
+    for tick in (1, 2, 2, 3, 3, 1):  # time may jump back
+        pose = conversions.pose_to_msg(conversions.header(tick * topics.TICK), (1.0, 0.0, 0.0))
+        node._on_pose(Received(tick * topics.TICK, pose, b""))
+    assert [conversions.stamp_of(said.transforms[0]) // topics.TICK for said in sent] == [1, 2, 3, 1]
+    node.destroy_node()
