@@ -9,6 +9,7 @@ import threading
 import time
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,9 +28,10 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import BagWriter, open_bag
 from mujoban_msgs_py.bags.errors import BagError
 from mujoban_msgs_py.bags.training import find_bags
+from mujoban_msgs_py.ros2 import topic_pub
 from mujoban_msgs_py.ros2.main import run
 from mujoban_msgs_py.ros2.messages import fill, to_csv, to_yaml
-from mujoban_msgs_py.ros2.session import CommandError
+from mujoban_msgs_py.ros2.session import CommandError, Session
 from mujoban_msgs_py.ros2.topic_measure import Bandwidth
 from mujoban_msgs_py.runtime.descriptors import described
 
@@ -155,6 +157,19 @@ def test_pub_stamps_with_the_time_where_it_is_asked_to(kind, values, before):
     text = ros2("topic", "pub", "--once", "-w", "0", "--keep-alive", "0", "/stamped", kind, values)
     stamp = re.search(rf"{re.escape(before)}stamp=builtin_interfaces\.msg\.Time\(sec=(\d+), nanosec=\d+\)", text)
     assert stamp is not None and int(sent_at) <= int(stamp[1]) <= time.time()
+
+
+def test_pub_keeps_to_its_rate_whatever_a_message_takes(monkeypatch):
+    now, waited = [0.0], []
+
+    def spin_for(_, seconds):
+        waited.append(seconds)
+        now[0] += max(0.0, seconds) + 0.02
+
+    monkeypatch.setattr(Session, "spin_for", spin_for)
+    monkeypatch.setattr(topic_pub, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    ros2("topic", "pub", "-r", "10", "-t", "5", "-w", "0", "--keep-alive", "0", "/quiet", "std_msgs/msg/String")
+    assert waited == pytest.approx([0.1, 0.08, 0.08, 0.08, 0.0])
 
 
 def test_nodes_are_listed_and_described(talker):
