@@ -38,8 +38,9 @@ def add_verb(verbs: Verbs) -> None:
     parser.add_argument("-l", "--loop", action="store_true", help="Play the bag again when it has ended")
     parser.add_argument("--start-offset", type=float, default=0.0, help="Start this many seconds into the bag")
     parser.add_argument(
-        "--wait-for-all-acked", type=int, default=5000, metavar="MS", help="At the end wait so long, 0: for ever"
-    )
+        "--wait-for-all-acked", type=int, default=5000, metavar="MS",
+        help="At the end wait so long for subscribers, 0: for ever, -1: not at all",
+    )  # fmt: skip
     parser.set_defaults(run=play)
 
 
@@ -47,23 +48,27 @@ class Player:
     """Publishes a bag's messages, serialised as they are, at the times at which they were recorded."""
 
     def __init__(self, session: Session, bag: Bag, options: argparse.Namespace) -> None:
-        """Make a publisher for every topic that is to be played."""
+        """Make a publisher for every topic that is to be played; one of an unknown type is left out with a warning."""
         self._session = session
         self._bag = bag
         self._rate = options.rate
         renamed = dict(_rename(text) for text in options.remap)
         excluded = {full_name(name) for name in options.exclude_topics}
         wanted = [full_name(n) for n in options.topics] if options.topics else list(bag.topics)
-        self._names = [name for name in wanted if name not in excluded]
-        missing = sorted(set(self._names) - bag.topics.keys())
+        names = [name for name in wanted if name not in excluded]
+        missing = sorted(set(names) - bag.topics.keys())
         if missing:
             raise CommandError(f"no topic {', '.join(missing)} in bag {bag.path}")
-        self.publishers: dict[str, Publisher] = {
-            name: session.node.create_publisher(
-                import_type(bag.topics[name].type_name, "msg"), renamed.get(name, name), _qos(bag.topics[name])
-            )
-            for name in self._names
-        }
+        self.publishers: dict[str, Publisher] = {}
+        log = session.node.get_logger().get_child("rosbag2_player")
+        for name in names:
+            try:
+                kind = import_type(bag.topics[name].type_name, "msg")
+            except CommandError as error:
+                log.warning(f"Topic '{name}' is not played: {error}")
+                continue
+            played_as = renamed.get(name, name)
+            self.publishers[name] = session.node.create_publisher(kind, played_as, _qos(bag.topics[name]))
         first = bag.span[0] if bag.span else 0
         self._start = first + round(options.start_offset * 1e9)
         self._clock = session.node.create_publisher(Clock, "/clock", 10) if options.clock > 0 else None
@@ -78,9 +83,9 @@ class Player:
             MATCH_LIMIT,
         )
 
-    def play(self) -> None:
-        """Play the bag once."""
-        begun = time.monotonic()
+    def play(self) -> int:
+        """Play the bag once, and return how many messages there were."""
+        begun, count = time.monotonic(), 0
         next_clock = begun if self._clock is not None else float("inf")
         for message in self._messages():
             due = begun + (message.stamp - self._start) / 1e9 / self._rate
@@ -95,9 +100,11 @@ class Player:
                     break
                 time.sleep(min(due, next_clock) - now)
             self.publishers[message.topic].publish(message.data)
+            count += 1
+        return count
 
     def _messages(self) -> Iterator[BagMessage]:
-        return (m for m in self._bag.messages(self._names) if m.stamp >= self._start)
+        return (m for m in self._bag.messages(self.publishers) if m.stamp >= self._start)
 
 
 def _rename(text: str) -> tuple[str, str]:
@@ -125,11 +132,14 @@ def play(options: argparse.Namespace) -> int:
         player = Player(session, bag, options)
         player.await_subscribers()
         session.spin_for(options.delay)
-        player.play()
+        count = player.play()
         while options.loop:
-            player.play()
-        # Subscribers would miss what they have not received when the publishers vanish. Negative means for ever.
-        limit = Duration(seconds=options.wait_for_all_acked / 1000 if options.wait_for_all_acked else -1)
-        for publisher in player.publishers.values():
-            publisher.wait_for_all_acked(limit)
+            if count == 0:
+                raise CommandError(f"nothing to play in a loop: no message of {bag.path} is wanted")
+            count = player.play()
+        if options.wait_for_all_acked >= 0:
+            # Subscribers would miss what they have not received when the publishers vanish. To rclpy, -1 is for ever.
+            limit = Duration(seconds=options.wait_for_all_acked / 1000 or -1)
+            for publisher in player.publishers.values():
+                publisher.wait_for_all_acked(limit)
     return 0
