@@ -144,7 +144,10 @@ def module_seeds(run_seed: int, number: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class Module(ABC):
-    """What the four modules have in common."""
+    """What the four modules have in common.
+
+    The arrays that `step` is given are the module's own, to write into.
+    """
 
     privileged: bool = False
     """Oracles set this and then receive `truth`; a learned module's `truth` is always None."""
