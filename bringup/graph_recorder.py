@@ -20,14 +20,14 @@ from mujoban_msgs_py.bags.writer import FLUSH_AFTER
 from mujoban_msgs_py.listening import Received, listen
 from mujoban_msgs_py.runtime.descriptors import RclpyOptions, declare, declare_run, described
 from mujoban_msgs_py.runtime.graph_node import GraphNode
-from mujoban_msgs_py.runtime.jumps import Jumps
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
-from mujoban_msgs_py.seldom import is_due
 from mujoban_msgs_py.topics import GRAPH_TOPICS, MODULE_TOPICS, RECORDED, SIMULATOR_TOPICS
 
 HELD_TICKS = 40
 """Unfinished ticks kept in real time, where answers may be late: 2 s."""
 QUEUE_DEPTH = 1024
+JUMP = 10
+"""Offers in a row of ticks before the latest in the bag by which time has jumped back; fewer may be a stranger's."""
 MOST_EPISODES = 2**31 - 1
 """In one file."""
 
@@ -78,9 +78,9 @@ class RecorderNode(GraphNode):
         )  # fmt: skip
         self._ticks: dict[int, dict[str, bytes]] = {}
         self._last_ticks: set[int] = set()
-        self._jumps = Jumps()
-        self._behind: tuple[int, dict[str, bytes]] = (-1, {})
-        """Stamp and messages of the latest tick that came though later ones are in the bag."""
+        self._behind: dict[int, dict[str, Received]] = {}
+        """Messages of ticks before the latest in the bag, since the simulator offered a later one."""
+        self._offers_behind = 0
         self.written = 0
         self._acknowledge = self.create_output(RECORDED)
         for topic in GRAPH_TOPICS.values():
@@ -95,35 +95,52 @@ class RecorderNode(GraphNode):
 
     def _receiver(self, name: str) -> Callable[[Received], None]:
         def receive(message: Received) -> None:
-            stamp, is_episode = message.stamp, name == topics.EPISODE.name
-            if is_episode and self._jumps.note(stamp, message.content.step, self.written):
-                self._start_anew(stamp)
-            if stamp > self.written:
-                self._ticks.setdefault(stamp, {}).setdefault(name, message.raw)
-                if is_episode and message.content.ended:
-                    self._last_ticks.add(stamp)
-                self._write_if_complete(stamp)
-                return
-            if stamp != self._behind[0]:
-                self._behind = (stamp, {})
-            self._behind[1].setdefault(name, message.raw)
-            if is_episode and stamp == self.written:
-                # The simulator offers a tick again that is in the bag: it has missed our word.
-                self._confirm(stamp)
+            if message.stamp > self.written:
+                self._take(name, message)
+            else:
+                self._look_back(name, message)
 
         return receive
 
-    def _start_anew(self, stamp: int) -> None:
-        """Go on with a tick [ns] of the past, of which something may have come before it was known for one."""
-        self.counts["jumps back of time"] += 1
-        if is_due(self, "jump back"):
-            self.get_logger().warning("simulated time jumped back: what follows goes into another file of the bag")
+    def _take(self, name: str, message: Received) -> None:
+        stamp = message.stamp
+        self._ticks.setdefault(stamp, {}).setdefault(name, message.raw)
+        if name == topics.EPISODE.name:
+            self._forget_behind()
+            if message.content.ended:
+                self._last_ticks.add(stamp)
+        self._write_if_complete(stamp)
+
+    def _look_back(self, name: str, message: Received) -> None:
+        """Note a message of a tick that is in the bag, or of another simulator whose time is behind."""
+        stamp = message.stamp
+        if name == topics.EPISODE.name and stamp == self.written:
+            self._forget_behind()
+            self._confirm(stamp)  # the simulator offers the tick again: it has missed our word
+            return
+        self._behind.setdefault(stamp, {}).setdefault(name, message)
+        if len(self._behind) > HELD_TICKS:
+            del self._behind[next(iter(self._behind))]
+        if name == topics.EPISODE.name:
+            self.counts["offers of earlier ticks"] += 1
+            self._offers_behind += 1
+            if self._offers_behind >= JUMP:
+                self._start_anew()
+
+    def _forget_behind(self) -> None:
+        self._behind, self._offers_behind = {}, 0
+
+    def _start_anew(self) -> None:
+        """Go on in the next file of the bag with the ticks that were offered behind those in the bag."""
+        self.get_logger().warning("simulated time jumped back: what follows goes into another file of the bag")
+        offered = [tick for tick in self._behind.values() if topics.EPISODE.name in tick]
+        self._forget_behind()
         self._flush(before=None)
         self._bag.split()
         self.written = 0
-        if stamp == self._behind[0]:
-            self._ticks[stamp] = self._behind[1]
-        self._behind = (-1, {})
+        for tick in offered:
+            for name, message in tick.items():
+                self._take(name, message)
 
     def _missing(self, stamp: int) -> list[str]:
         expected = SIMULATOR_TOPICS if stamp in self._last_ticks else (*SIMULATOR_TOPICS, *self._answers)
