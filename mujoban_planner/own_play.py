@@ -23,6 +23,8 @@ from mujoban_sokoban.bitboard import SQUARES
 
 _KEPT: Final = 1024
 """States of own play that wait for an audit, the newest."""
+_PER_WAY: Final = 4
+"""States of a play of which a push is audited: about so many can be, while levels are played."""
 _LEAST, _MOST = 0.003, 0.7
 """A push is audited that is called deadly with a probability between these: of others there is hardly a doubt."""
 _UNLIKELY: Final = 0.3
@@ -117,10 +119,10 @@ class AuditQueue:
         return len(self._states)
 
     def add(self, wall: int, target: int, way: Iterable[Pushed], rng: np.random.Generator) -> None:
-        """Let one of the states of a way wait."""
+        """Let some of the states of a way wait."""
         states = list(way)
-        if states:
-            box, agent, _ = states[int(rng.integers(len(states)))]
+        for i in rng.permutation(len(states))[:_PER_WAY].tolist():
+            box, agent, _ = states[i]
             self._states.append((wall, target, box, agent))
 
     def take(self, count: int) -> BitBoards:
