@@ -6,7 +6,7 @@ Shapes: S states, D = 4 directions, I = 8.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any, Final
@@ -23,8 +23,6 @@ from mujoban_sokoban.bitboard import SQUARES
 
 _KEPT: Final = 1024
 """States of own play that wait for an audit, the newest."""
-_PER_WAY: Final = 4
-"""States of a play of which a push is audited: about so many can be, while levels are played."""
 _LEAST, _MOST = 0.003, 0.7
 """A push is audited that is called deadly with a probability between these: of others there is hardly a doubt."""
 _UNLIKELY: Final = 0.3
@@ -104,7 +102,7 @@ class Lead:
 
 
 class AuditQueue:
-    """States that won play came through, of which one push each is to be judged by a search.
+    """States that own play came through while a solution was left, of which one push each is to be judged by a search.
 
     What searches prove beside a way is a choice: a solution is found sooner than the proof that there is none. A push
     that is chosen before anything is known of it tells how often such pushes are deadly.
@@ -118,11 +116,10 @@ class AuditQueue:
         """Return the number of states that wait."""
         return len(self._states)
 
-    def add(self, wall: int, target: int, way: Iterable[Pushed], rng: np.random.Generator) -> None:
-        """Let some of the states of a way wait."""
-        states = list(way)
-        for i in rng.permutation(len(states))[:_PER_WAY].tolist():
-            box, agent, _ = states[i]
+    def add(self, wall: int, target: int, way: Sequence[Pushed], share: float, rng: np.random.Generator) -> None:
+        """Let each of the states of a way wait by a chance of `share`."""
+        for i in np.flatnonzero(rng.random(len(way)) < share).tolist():
+            box, agent, _ = way[i]
             self._states.append((wall, target, box, agent))
 
     def take(self, count: int) -> BitBoards:

@@ -29,7 +29,7 @@ from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import BitBoards, push_box
 from mujoban_planner.forest import Forest, Verdicts
 from mujoban_planner.lessons import errs
-from mujoban_planner.own_play import AuditQueue, Lead, Phase, draw_doubtful
+from mujoban_planner.own_play import AuditQueue, Lead, Phase, Pushed, draw_doubtful
 from mujoban_planner.samples import Samples, concatenate, unlabelled
 from mujoban_planner.search import GraphedEvaluation, evaluate_boards, grow
 from mujoban_planner.search_labels import label_pushes, label_verdicts, label_ways
@@ -44,6 +44,9 @@ from mujoban_rl.precision import autocast
 
 KINDS: Final = ("way", "verdict", "audit")
 """Of samples: on ways that were found; off them, with what was proved there; pushes that were audited."""
+_AUDITS: Final = 0.5
+"""Share of the states of own play of which a push is to be audited, where it is known that they leave a solution: about
+as many can be, while levels are played."""
 _LONG: Final = 15
 """Expansions from which on a search may have proved something that is not seen at once."""
 _NONE: Final = np.zeros(0, np.uint64)
@@ -243,6 +246,7 @@ class SearchActor(Actor):
             return False
         if (fatal := lead.fatal) is not None:
             lessons["verdict"].append(label_pushes(self._forest, row, [fatal], dead=True))
+            self._wait(row, lead.way[: lead.alive + 1], 1.0)
         if lead.middle is None and lead.alive:
             return False
         lead.phase, lead.root = Phase.SEARCH, lead.middle or 0
@@ -304,18 +308,26 @@ class SearchActor(Actor):
 
     def _end_play(self, row: int, won: bool, shut: bool, ended: Ended) -> None:
         """Take note of how a level was played, whether at the end no push was left; what is lost is searched."""
-        lead, ticket, trees = self._leads[row], self._tickets[row], self._forest.trees
+        lead, ticket = self._leads[row], self._tickets[row]
         self._levels.rate(ticket, won)
         ended[f"play/{ticket.kind}"].append(won)
         self._budgets[row], lead.root = 0, len(lead.way)
         lead.phase = Phase.WON if won else Phase.LOST
         if won:
             self._levels.solved_by(ticket, self._pushes(row))
-            # Of levels that are easier there is less to learn, and at first they are all that is won.
-            if ticket.difficulty == max(DIFFICULTIES):
-                self._audits.add(int(trees.wall[row]), int(trees.target[row]), lead.way, self._rng)
+            self._wait(row, lead.way, self.config.led)
         elif self._rng.random() < self.config.led:
             lead.lost, lead.proved = len(lead.way), shut
+
+    def _wait(self, row: int, way: Sequence[Pushed], share: float) -> None:
+        """Let states of own play, all of which left a solution, wait for audits.
+
+        Of all play each with the same chance: were they of won play alone, pushes that lose would seldom be audited.
+        Of levels that are easier there is less to learn, and at first they are all that is won.
+        """
+        if self._tickets[row].difficulty == max(DIFFICULTIES):
+            wall, target = int(self._forest.trees.wall[row]), int(self._forest.trees.target[row])
+            self._audits.add(wall, target, way, _AUDITS * share, self._rng)
 
     def _pushes(self, row: int) -> list[int]:
         """Return the pushes from where a level began to the end of the way that a search found."""

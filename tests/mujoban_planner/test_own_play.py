@@ -52,7 +52,7 @@ def test_audits_ask_about_pushes_that_are_possible_and_doubted():
 def test_states_wait_for_an_audit_until_they_are_taken():
     queue, again = AuditQueue(), AuditQueue()
     for i in range(3):
-        queue.add(2**63, 2, [(i, i, i)], np.random.default_rng(0))
+        queue.add(2**63, 2, [(i, i, i)], 1.0, np.random.default_rng(0))
     again.restore(queue.values)
     for waiting in (queue, again):
         assert waiting.take(2).box.tolist() == [2, 1]
