@@ -27,7 +27,7 @@ from mujoban_controller.goal_view import StoredView
 from mujoban_controller.play import Fields, Player
 from mujoban_controller.privileged import PrivilegedPolicy
 from mujoban_core.bodies import Body, get_body
-from mujoban_core.grid import AGENT, CONTROL_PERIOD, GRID_SIZE, INSTRUCTION_LIMIT, WALL
+from mujoban_core.grid import CONTROL_PERIOD, INSTRUCTION_LIMIT, WALL, robot_cells
 from mujoban_core.interfaces import renew_rows
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.bags import Bag, BagError
@@ -72,13 +72,10 @@ def transitions(ticks: Sequence[tuple[Any, ...]], config: GoalTaskConfig) -> Fie
         raise BagError(f"proprioception of {len(proprio[0])} values: expected a bag of the body {body.name}")
     boxes, abstract = np.stack(box), np.stack(state)
     cells = cells_of_boxes(boxes, body.cell_size)
-    agent = abstract[..., AGENT].reshape(len(ticks), -1).argmax(-1)
     wall, completed = abstract[..., WALL] > 0.5, np.array([t.terminated for t in true])
     # Bags do not hold the boxes' speed. It is that over the ticks before and after.
     velocity_of_boxes = np.gradient(boxes, CONTROL_PERIOD, axis=0)
-    goals, elapsed = _goals(
-        instruction, completed, wall, np.stack([agent // GRID_SIZE, agent % GRID_SIZE], -1), cells, body
-    )
+    goals, elapsed = _goals(instruction, completed, wall, robot_cells(abstract), cells, body)
     view = StoredView(
         body, len(ticks), goals, np.stack(proprio), np.stack(pose), np.stack(velocity),
         boxes, np.linalg.norm(velocity_of_boxes, axis=-1), cells, wall,

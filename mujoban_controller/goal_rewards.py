@@ -144,8 +144,7 @@ class GoalReward:
     def _turning(self, world: GoalView) -> NDArray[np.float64]:
         """Return what turning to the left earns where there is nothing else to do, [B]."""
         at, c = world.body.proprio, self.config
-        rate = (world.proprio[:, at.angular_velocity] * world.proprio[:, at.up_axis]).sum(1)
-        turned = np.clip(rate, -c.fastest_turn, c.fastest_turn) * CONTROL_PERIOD
+        turned = np.clip(at.turn_rate(world.proprio), -c.fastest_turn, c.fastest_turn) * CONTROL_PERIOD
         off = np.hypot(*(world.goals.robot_target - world.pose[:, :2]).T) / world.body.cell_size
         placed = np.maximum(1.0 - off / _PLACE, 0.0)
         return c.turn * turned * placed * (world.goals.kind == GoalKind.HOLD)

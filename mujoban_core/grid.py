@@ -8,7 +8,7 @@ column 0 the westernmost, as in a level text.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Final, Protocol, Self, TypeVar
+from typing import Any, Final, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,6 +84,12 @@ def turn_to_instruction(x: Values, y: Values, axis_x: Values, axis_y: Values) ->
         axis_y: North of it.
     """
     return x * axis_x + y * axis_y, y * axis_x - x * axis_y
+
+
+def robot_cells(abstract_state: NDArray[Any]) -> NDArray[np.int64]:
+    """Return the (row, column) in which the robot is most likely, [..., 2], given s_abst, [..., N, N, 4]."""
+    layer = abstract_state[..., AGENT]
+    return np.stack(np.divmod(layer.reshape(*layer.shape[:-2], -1).argmax(-1), layer.shape[-1]), -1)
 
 
 def cell_to_xy(cell: ArrayLike, cell_size: float = CELL_SIZE) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mujoban_core.bodies import BALL, Body
 from mujoban_core.camera import CameraMount
-from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, OFFSETS_XY, WALL, Instruction
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_RC, OFFSETS_XY, WALL, Instruction, cell_to_xy
 from mujoban_core.visibility import cells_in_view
 
 MIN_GAIN: Final = 3
@@ -109,8 +109,7 @@ def _views(
     wall: NDArray[np.float32], cells: NDArray[np.int64], body: Body, headings: NDArray[np.floating]
 ) -> NDArray[np.bool_]:
     """Return which cells are seen from each of `cells`, [V], with any of some headings, [V, N * N]."""
-    half = (GRID_SIZE - 1) / 2
-    x, y = body.cell_size * (cells % GRID_SIZE - half), body.cell_size * (half - cells // GRID_SIZE)
+    x, y = cell_to_xy(np.stack(np.divmod(cells, GRID_SIZE), -1), body.cell_size).T
     turns = len(headings)
     pose = np.stack([np.repeat(x, turns), np.repeat(y, turns), np.tile(headings, len(cells))], -1)
     opaque = np.broadcast_to(wall > _OPAQUE, (len(pose), GRID_SIZE, GRID_SIZE))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoban_core.bodies import BODIES
-from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_XY, TARGET, WALL, Instruction, xy_to_cell
+from mujoban_core.grid import AGENT, BOX, GRID_SIZE, OFFSETS_XY, TARGET, WALL, Instruction, robot_cells, xy_to_cell
 from mujoban_core.interfaces import (
     Controller,
     ControllerInput,
@@ -186,10 +186,8 @@ def follow_goals(inputs: ControllerInput, memory: Memory, cell_size: float) -> t
     issued = np.flatnonzero(inputs.terminated | (goals.kind == GoalKind.NONE))
     if issued.size:
         layers = truth.abstract_state
-        agent = layers[..., AGENT].reshape(len(layers), -1).argmax(-1)
-        cells = np.stack([agent // GRID_SIZE, agent % GRID_SIZE], -1)
         boxes_at = cells_of_boxes(truth.box_position, cell_size)
-        goals.begin(issued, inputs.instruction, layers[..., WALL] > 0.5, cells, boxes_at)
+        goals.begin(issued, inputs.instruction, layers[..., WALL] > 0.5, robot_cells(layers), boxes_at)
     return goals, truth
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ from mujoban_core.camera import CameraMount
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+Readings = TypeVar("Readings", NDArray[np.float32], "Tensor")
 
 FIRST_PERSON_CAMERA: Final = "first_person"
 """Name of the camera that every body carries; it yields o_cam."""
@@ -148,9 +150,10 @@ class ProprioSlices(NamedTuple):
             planar_velocity=slice(0, 2),
         )
 
-    def turn_rate(self, proprio: Tensor) -> Tensor:
+    def turn_rate(self, proprio: Readings) -> Readings:
         """Return the rate of turning about the vertical, however the robot leans, [...] rad/s, given o_pr, [..., P]."""
-        return (proprio[..., self.angular_velocity] * proprio[..., self.up_axis]).sum(-1)
+        rate = proprio[..., self.angular_velocity] * proprio[..., self.up_axis]
+        return rate.sum(-1)  # pyright: ignore[reportReturnType] - of an array it is Any
 
 
 @dataclass(frozen=True)
