@@ -117,7 +117,7 @@ def test_in_real_time_what_was_not_recorded_is_counted(play_graph, tmp_path):
     from rclpy.parameter import Parameter
 
     names = ["simulator", "estimator", "termination", "planner", "controller"]
-    graph = play_graph(names=names, realtime=4.0, resend_after=2.0, hold_limit=100)
+    graph = play_graph(names=names, realtime=4.0, resend_after=10.0, hold_limit=100)
     path = Parameter("path", value=str(tmp_path / "bag"))
     graph.spin_until(lambda: graph.simulator.ticks >= 3)
     recorder = graph.graph.add(RecorderNode(parameter_overrides=[path]))
