@@ -14,8 +14,8 @@ from mujoban_planner.uncertainty import Uncertainty
 from mujoban_rl.actors import Experience
 from mujoban_rl.engine import State
 
-_AUDITS: Final = 0.75
-"""Share of the states that are not on a way in which a push was audited."""
+_JUDGED: Final = {"audit": 0.45, "played": 0.35}
+"""Shares of the states of a batch that are on no way by what is known of them; of the others what was proved."""
 
 
 class LessonStore:
@@ -40,14 +40,14 @@ class LessonStore:
         if held["way"] < size:
             return None
         judged = int(size * self.config.judged) if held["verdict"] > size else 0
-        audits = int(judged * _AUDITS) if held["audit"] > size else 0
-        counts = {"way": size - judged, "verdict": judged - audits, "audit": audits}
+        freely = {kind: int(judged * share) if held[kind] > size else 0 for kind, share in _JUDGED.items()}
+        counts = {"way": size - judged, "verdict": judged - sum(freely.values()), **freely}
         parts = [self.buffers[kind].draw(count, self._rng) for kind, count in counts.items() if count]
         # What is blurred and hidden are the first and the last of a batch: states of all kinds, hence.
         order = self._rng.permutation(size)
         batch = make_batch(concatenate(parts).take(order), self._rng.integers(0, SYMMETRIES, size))
         state = self._uncertainty.apply(batch.state, self._generator, self._rng)
-        return batch._replace(state=state, chosen=torch.from_numpy(order < size - audits))
+        return batch._replace(state=state, chosen=torch.from_numpy(order < counts["way"] + counts["verdict"]))
 
     def state(self) -> State:
         """Return the lessons and the random states."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.push_env import possible_masks
+from mujoban_planner.samples import Samples, make_batch
 from mujoban_rl.precision import autocast
 from mujoban_sokoban.bitboard import SQUARES
 
@@ -25,6 +26,8 @@ _KEPT: Final = 1024
 """States of own play that wait for an audit, the newest."""
 _LEAST, _MOST = 0.003, 0.7
 """A push is audited that is called deadly with a probability between these: of others there is hardly a doubt."""
+_UNDOUBTED: Final = 0.1
+"""Share that is learned from of pushes that were played without a doubt."""
 _UNLIKELY: Final = 0.3
 """What makes also pushes that are hardly wanted come into an audit."""
 
@@ -79,21 +82,19 @@ class Lead:
         lead.way = [(box, agent, push) for box, agent, push in lead.way]
         return lead
 
-    def learn(self, *, solved: bool, lost: bool) -> list[Pushed]:
-        """Take in what the search from `root` came to; return the pushes that it has shown to be safe."""
+    def learn(self, *, solved: bool, lost: bool) -> None:
+        """Take in what the search from `root` came to."""
         if solved:
-            before, self.alive = self.alive, self.root
-            return self.way[before : self.root]
-        if lost:
+            self.alive = self.root
+        elif lost:
             self.lost, self.proved = self.root, True
         else:
             self.lost, self.proved = self.alive, False  # nobody knows: the search for it is over
-        return []
 
     @property
-    def fatal(self) -> Pushed | None:
-        """The push that lost the level, once it is found."""
-        return self.way[self.alive] if self.proved and self.lost - self.alive == 1 else None
+    def found(self) -> bool:
+        """Whether it is known which push lost the level: the one after `alive` others."""
+        return self.proved and self.lost - self.alive == 1
 
     @property
     def middle(self) -> int | None:
@@ -138,6 +139,23 @@ class AuditQueue:
         """Take over `values`."""
         self._states.clear()
         self._states.extend((wall, target, box, agent) for wall, target, box, agent in values)
+
+
+@torch.inference_mode()
+def choose_played(planner: LearnedPlanner, samples: Samples, rng: np.random.Generator) -> Samples:
+    """Return of states of which one push was judged, since it was played, those in which it was doubted, and others.
+
+    The choice depends on what the planner says of the push, not on what it is.
+    """
+    if not len(samples.agent):
+        return samples
+    batch = make_batch(samples, np.zeros(len(samples.agent), np.int64)).to(planner.device)
+    with autocast(planner.device):
+        output, _ = planner.read(batch.state)
+    if output.push_dead is None:
+        return samples.take(np.zeros(0, np.int64))
+    dead = (output.push_dead.float().sigmoid() * batch.push_known).sum((1, 2, 3)).cpu().numpy()
+    return samples.take(((dead > _LEAST) & (dead < _MOST)) | (rng.random(len(dead)) < _UNDOUBTED))
 
 
 @torch.inference_mode()

@@ -29,7 +29,7 @@ from mujoban_planner.abstract_env import MOVE_LIMIT
 from mujoban_planner.boards import BitBoards, push_box
 from mujoban_planner.forest import Forest, Verdicts
 from mujoban_planner.lessons import errs
-from mujoban_planner.own_play import AuditQueue, Lead, Phase, Pushed, draw_doubtful
+from mujoban_planner.own_play import AuditQueue, Lead, Phase, Pushed, choose_played, draw_doubtful
 from mujoban_planner.samples import Samples, concatenate, unlabelled
 from mujoban_planner.search import GraphedEvaluation, evaluate_boards, grow
 from mujoban_planner.search_labels import label_pushes, label_verdicts, label_ways
@@ -42,8 +42,9 @@ from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
 from mujoban_rl.precision import autocast
 
-KINDS: Final = ("way", "verdict", "audit")
-"""Of samples: on ways that were found; off them, with what was proved there; pushes that were audited."""
+KINDS: Final = ("way", "verdict", "played", "audit")
+"""Of samples: on ways that were found; off them, with what was proved there; pushes of own play; pushes that were
+audited."""
 _AUDITS: Final = 0.5
 """Share of the states of own play of which a push is to be audited, where it is known that they leave a solution: about
 as many can be, while levels are played."""
@@ -72,8 +73,8 @@ class SearchConfig(LevelConfig, UncertaintyConfig):
     walks: float = 0.25
     """Share that is kept of the states between two pushes."""
     led: float = 0.5
-    """Share of own play that was lost of which searches look for the push that lost it; of other, they begin at the
-    start."""
+    """Share of own play whose pushes are learned from; where it was lost, searches look for the push that lost it. Of
+    other lost play they begin at the start."""
     lead: int = 40
     """Pushes of own play at most; where it wins, nothing is searched."""
     audited: float = 0.5
@@ -151,8 +152,9 @@ class SearchActor(Actor):
         for _ in range(self.config.steps):
             self._advance(lessons, ended)
         kept = {kind: concatenate(parts) for kind, parts in lessons.items()}
-        # Audits stay as they are: a choice of those in which it errs would be one by what they came to.
+        # Of the others a choice of those in which it errs would be one by what they came to.
         kept |= {kind: self._prioritise(kept[kind]) for kind in ("way", "verdict")}
+        kept["played"] = choose_played(self.planner, kept["played"], self._rng)
         arrays = {f"{kind}.{n}": column for kind, samples in kept.items() for n, column in samples._asdict().items()}
         arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         statistics = {name: np.array(solved, np.float32) for name, solved in ended.items()}
@@ -187,7 +189,7 @@ class SearchActor(Actor):
             self._end_search(row, bool(proved.lost[0]), lessons, ended)
         self._begin([row for row in over if not self._go_on(row, lessons)])
         self._grow()
-        self._play(ended)
+        self._play(lessons, ended)
 
     def _begin(self, rows: list[int]) -> None:
         """Begin with an audit or another level in each of these trees."""
@@ -231,8 +233,7 @@ class SearchActor(Actor):
         if solved:
             self._levels.solved_by(ticket, self._pushes(row))
         if lead.root:
-            safe = lead.learn(solved=solved, lost=lost)
-            lessons["verdict"].append(label_pushes(self._forest, row, safe, dead=False))
+            lead.learn(solved=solved, lost=lost)
             return
         if not solved:
             self._levels.come_again(ticket)
@@ -244,9 +245,8 @@ class SearchActor(Actor):
         lead = self._leads[row]
         if lead.phase is not Phase.LOST and not (lead.phase is Phase.SEARCH and lead.root):
             return False
-        if (fatal := lead.fatal) is not None:
-            lessons["verdict"].append(label_pushes(self._forest, row, [fatal], dead=True))
-            self._wait(row, lead.way[: lead.alive + 1], 1.0)
+        if lead.found:
+            self._use(row, lead.way[: lead.alive + 1], lessons, lost=True)
         if lead.middle is None and lead.alive:
             return False
         lead.phase, lead.root = Phase.SEARCH, lead.middle or 0
@@ -285,7 +285,7 @@ class SearchActor(Actor):
         with autocast(self.planner.device):
             return evaluate_boards(self.planner, boards)
 
-    def _play(self, ended: Ended) -> None:
+    def _play(self, lessons: Lessons, ended: Ended) -> None:
         """Push once by chance, as the planner's probabilities are, in every tree that is played.
 
         Of each the first node was just expanded.
@@ -297,7 +297,7 @@ class SearchActor(Actor):
         full = np.array([len(self._leads[row].way) == self.config.lead for row in rows.tolist()], np.bool_)
         over = won | full | shut
         for row, solved, stuck in zip(rows[over].tolist(), won[over].tolist(), shut[over].tolist(), strict=True):
-            self._end_play(row, solved, stuck, ended)
+            self._end_play(row, solved, stuck, lessons, ended)
         rows, children = rows[~over], children[~over]
         states = zip(
             trees.box[rows, 0].tolist(), trees.agent[rows, 0].tolist(), trees.push[rows, children].tolist(), strict=True
@@ -306,7 +306,7 @@ class SearchActor(Actor):
             self._leads[row].way.append(state)
         forest.plant(rows, forest.boards(rows, children))
 
-    def _end_play(self, row: int, won: bool, shut: bool, ended: Ended) -> None:
+    def _end_play(self, row: int, won: bool, shut: bool, lessons: Lessons, ended: Ended) -> None:
         """Take note of how a level was played, whether at the end no push was left; what is lost is searched."""
         lead, ticket = self._leads[row], self._tickets[row]
         self._levels.rate(ticket, won)
@@ -315,19 +315,24 @@ class SearchActor(Actor):
         lead.phase = Phase.WON if won else Phase.LOST
         if won:
             self._levels.solved_by(ticket, self._pushes(row))
-            self._wait(row, lead.way, self.config.led)
-        elif self._rng.random() < self.config.led:
-            lead.lost, lead.proved = len(lead.way), shut
+        if self._rng.random() < self.config.led:  # of all play alike
+            if won:
+                self._use(row, lead.way, lessons, lost=False)
+            else:
+                lead.lost, lead.proved = len(lead.way), shut
 
-    def _wait(self, row: int, way: Sequence[Pushed], share: float) -> None:
-        """Let states of own play, all of which left a solution, wait for audits.
+    def _use(self, row: int, way: Sequence[Pushed], lessons: Lessons, *, lost: bool) -> None:
+        """Learn from pushes of own play, in states that leave a solution, of which the last one may have lost it.
 
-        Of all play each with the same chance: were they of won play alone, pushes that lose would seldom be audited.
-        Of levels that are easier there is less to learn, and at first they are all that is won.
+        In some of these states another push may be audited. Of levels that are easier there is less to learn, and at
+        first they are all that is won.
         """
+        safe = len(way) - lost
+        for pushes, dead in ((way[:safe], False), (way[safe:], True)):
+            lessons["played"].append(label_pushes(self._forest, row, pushes, dead=dead))
         if self._tickets[row].difficulty == max(DIFFICULTIES):
             wall, target = int(self._forest.trees.wall[row]), int(self._forest.trees.target[row])
-            self._audits.add(wall, target, way, _AUDITS * share, self._rng)
+            self._audits.add(wall, target, way, _AUDITS, self._rng)
 
     def _pushes(self, row: int) -> list[int]:
         """Return the pushes from where a level began to the end of the way that a search found."""

@@ -60,7 +60,8 @@ def audits():
 
 
 def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons, audits):
-    for samples, both, least in ((lessons["way"], True, 30), (lessons["verdict"], False, 30), (audits, True, 3)):
+    for kind, both, least in (("way", True, 30), ("verdict", False, 30), ("played", True, 3), ("audit", True, 3)):
+        samples = (lessons | {"audit": audits})[kind]
         state, direction, square, deadly = judged_pushes(samples)
         one = np.uint64(1)
         box = samples.box[state] ^ (one << square.astype(np.uint64))
