@@ -24,30 +24,28 @@ def add_simulator():
     return add
 
 
-def test_a_simulator_whose_time_another_was_ahead_of_goes_on_in_mid_episode(play_graph, add_simulator):
-    graph = play_graph(episodes=Episodes(1, 5, difficulty=2), resend_after=0.1)
-    graph.spin_until(lambda: graph.simulator.ticks >= 10)
+def goes_on_after(graph, add_simulator, ticks=0, beyond=None):
+    """Pause, let another simulator play so many ticks, or so many more than this one, end it, and go on."""
     graph.call(SetBool, "/pause", SetBool.Request(data=True))
     held = graph.simulator.ticks
     second = add_simulator(graph)
-    graph.spin_until(lambda: second.ticks >= held + 10)
+    graph.spin_until(lambda: second.ticks >= (ticks if beyond is None else held + beyond))
     graph.graph.end(second)
     graph.call(SetBool, "/pause", SetBool.Request(data=False))
     graph.spin_until(lambda: graph.simulator.ticks >= held + 10)
     assert graph.simulator.counts["repeated ticks"] < 30, "a module waits for what was said to the other one"
+
+
+def test_a_simulator_whose_time_another_was_ahead_of_goes_on_in_mid_episode(play_graph, add_simulator):
+    graph = play_graph(episodes=Episodes(1, 5, difficulty=2), resend_after=0.1)
+    graph.spin_until(lambda: graph.simulator.ticks >= 10)
+    goes_on_after(graph, add_simulator, beyond=10)
 
 
 def test_a_simulator_does_not_stall_for_what_another_made_the_modules_forget(play_graph, add_simulator):
     graph = play_graph(episodes=Episodes(1, 5, difficulty=2), resend_after=0.1)
     graph.spin_until(lambda: graph.simulator.ticks >= 30)
-    graph.call(SetBool, "/pause", SetBool.Request(data=True))
-    held = graph.simulator.ticks
-    second = add_simulator(graph)
-    graph.spin_until(lambda: second.ticks >= 3)
-    graph.graph.end(second)
-    graph.call(SetBool, "/pause", SetBool.Request(data=False))
-    graph.spin_until(lambda: graph.simulator.ticks >= held + 10)
-    assert graph.simulator.counts["repeated ticks"] < 30, "a module waits for what was said to the other one"
+    goes_on_after(graph, add_simulator, ticks=3)
 
 
 def test_a_second_simulator_is_recorded_into_another_file_and_no_tick_is_confirmed_that_is_not(
