@@ -238,6 +238,8 @@ def expand(
             total += np.exp(push[i, direction_of[k], square_of[k]] - largest)
         if options:
             walk_distances(start, free, distance)
+        base = trees.parent[row, trees.branch[row, node]] if asked else 0
+        depth, scale = trees.depth[row, node] + 1, largest + np.log(total) if options else 0.0
         for k in range(options):
             direction, square = direction_of[k], square_of[k]
             moves = trees.moves[row, node] + distance[square - SQUARE_STEP[direction]] + 1
@@ -252,9 +254,7 @@ def expand(
                 break
             if after == target and trees.solution[row] >= 0:
                 continue  # the first solution stands
-            base = trees.parent[row, trees.branch[row, node]] if asked else 0
-            depth = trees.depth[row, node] + 1
-            logp = trees.logp[row, node] + push[i, direction, square] - largest - np.log(total)
+            logp = trees.logp[row, node] + push[i, direction, square] - scale
             cost = _cost(trees, row, base, depth, logp) - DEAD_WEIGHT * alive[i]
             # What was evaluated says the same of its state by any way, and questions ask which way a node came by.
             if seen >= 0 and (asked or trees.expanded[row, seen] or trees.cost[row, seen] <= cost):

@@ -113,10 +113,6 @@ class AuditQueue:
         """Begin with no state."""
         self._states: deque[tuple[int, int, int, int]] = deque(maxlen=_KEPT)
 
-    def __len__(self) -> int:
-        """Return the number of states that wait."""
-        return len(self._states)
-
     def add(self, wall: int, target: int, way: Sequence[Pushed], share: float, rng: np.random.Generator) -> None:
         """Let each of the states of a way wait by a chance of `share`."""
         for i in np.flatnonzero(rng.random(len(way)) < share).tolist():

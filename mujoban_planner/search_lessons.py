@@ -270,9 +270,9 @@ class SearchActor(Actor):
         searching = forest.trees.solution < 0
         grow(forest, np.arange(self.config.trees), self._evaluate)
         solved = np.flatnonzero(searching & (forest.trees.solution >= 0))
-        asked = np.array([lead.phase is Phase.AUDIT for lead in self._leads])
-        self._budgets[asked & (forest.trees.solution >= 0)] = 0  # that was all
-        solved = solved[~asked[solved]]
+        audited = np.array([self._leads[row].phase is Phase.AUDIT for row in solved.tolist()], np.bool_)
+        self._budgets[solved[audited]] = 0  # that was all
+        solved = solved[~audited]
         forest.question(solved)
         self._budgets[solved] = forest.expansions[solved] + self.config.questions
 
