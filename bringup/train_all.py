@@ -83,6 +83,8 @@ _VIEWS: Final = ("--noise", "0.05", "--hidden", "0.1")
 """Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
 _MINED: Final = ("--mined", "0.5")
 """Of a planner that goes on, half of the levels are such as it lost: of others it wins most, and learns nothing."""
+_GENTLY: Final = ("--learning-rate", "4e-4")
+"""And it keeps what it knows: at a rate for weights as drawn it is worse until the rate falls again."""
 _LEVELS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
 _VALIDATION_PER_HOUR: Final = 6
@@ -197,7 +199,7 @@ def _controller(options: Options) -> list[Stage]:
 def _planner(options: Options) -> list[Stage]:
     """Return the training of the planner, on boards in full view and as an estimator sees them."""
     product = WEIGHTS["planner"]
-    network = () if options.before is None else options.machine.begun_with(options.before / product)
+    last = () if options.before is None else (*options.machine.begun_with(options.before / product), *_GENTLY)
     every = max(1, round(_seconds(options, "planner") / _PLANNER_EVALUATIONS))
     command = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.stream))
     command += ("--evaluate-every", str(every))
@@ -205,7 +207,7 @@ def _planner(options: Options) -> list[Stage]:
     return [
         _trainer(
             options, "planner", (*command, *begun, *_VIEWS), product, sources=_sources(options, "planner"),
-            last=network,
+            last=last,
         )
     ]  # fmt: skip
 
