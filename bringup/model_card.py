@@ -102,11 +102,11 @@ PURPOSES: Final[dict[str, Purpose]] = {
         "Solves most levels, not all: an estimate that is wrong misleads it, and without the search ahead it also "
         "pushes, on a right one, into states from which there is no way to the end. Boards of 8 x 8 inner cells; more "
         "than four boxes were not trained on.",
-        "(1) what was tried loses attraction; (2) verdicts on pushes are weighed by a constant; (3) before a push that "
-        "may be deadly it looks at the board from every side; (4) a fixed recursion by the rules of Sokoban tells what "
-        "can be reached and the way to a push; (5) a tree search by these rules, guided by the network, looks ahead "
-        "for a way to the end (`--look-ahead 0`: none); (6) a rule says where to look before each decision, for up to "
-        "30 instructions an episode after the first look",
+        "(1) what was tried loses attraction; (2) verdicts on pushes are moved to the safe side and weighed, by "
+        "constants; (3) before a push that may be deadly it looks at the board from every side; (4) a fixed "
+        "recursion by the rules of Sokoban tells what can be reached and the way to a push; (5) a tree search by "
+        "these rules, guided by the network, looks ahead for a way to the end (`--look-ahead 0`: none); (6) a rule "
+        "says where to look before each decision, for up to 30 instructions an episode after the first look",
         {
             "imitation": "supervised, by an optimal solver, also on its own play",
             "expert-iteration": "by its own play and search, without a solver",

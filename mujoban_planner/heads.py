@@ -16,6 +16,9 @@ from mujoban_planner.propagation import legal_pushes, walk_to_push
 
 INSTRUCTIONS: Final = len(Instruction)
 INTERIOR: Final = GRID_SIZE - 2
+WARINESS: Final = (0.7, 2.0)
+"""Factor and summand of the logit of a push's verdict where a decision weighs it: what solved most of harder levels
+than those that taught it (docs/research/planner.md). A small doubt counts then: 0.1 % as 5.5 %."""
 
 
 class PlannerOutput(NamedTuple):
@@ -46,7 +49,8 @@ class Advice(NamedTuple):
     push: Tensor
     """Log-probability of each next push, [B, D, I, I]."""
     push_alive: Tensor
-    """log(1 - p(dead)) of each push, [B, D, I, I]; zeros for a network that does not judge pushes."""
+    """log(1 - p(dead)) of each push, to the safe side (`wary_verdicts`), [B, D, I, I]; zeros for a network that does
+    not judge pushes."""
 
 
 class Weighed(NamedTuple):
@@ -57,7 +61,7 @@ class Weighed(NamedTuple):
     push: Tensor
     """Log-probability of each next push, the mean over the views so far, [B, D, I, I]."""
     push_alive: Tensor
-    """log(1 - p(dead)) of each push, likewise."""
+    """log(1 - p(dead)) of each push, to the safe side, likewise."""
     alive: Tensor
     """log(1 - p(dead | s)) of the state itself, [B]."""
 
@@ -155,6 +159,14 @@ def verdicts(output: PlannerOutput) -> Tensor:
     if output.push_dead is None:
         return torch.zeros_like(output.push)
     return log_alive(output.push_dead)
+
+
+def wary_verdicts(output: PlannerOutput) -> Tensor:
+    """Return the verdicts as a decision weighs them, to the safe side, since a push can't be taken back."""
+    if output.push_dead is None:
+        return torch.zeros_like(output.push)
+    factor, summand = WARINESS
+    return log_alive(factor * output.push_dead + summand)
 
 
 def log_alive(dead: Tensor) -> Tensor:

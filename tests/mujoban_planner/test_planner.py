@@ -7,7 +7,7 @@ from mujoban_core.grid import GRID_SIZE, Instruction
 from mujoban_core.interfaces import take_rows
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.decision import HISTORY, count_visits, initial_means, initial_visits, recall, remember
-from mujoban_planner.heads import Advice, PlannerHeads
+from mujoban_planner.heads import Advice, PlannerHeads, verdicts
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
 from mujoban_planner.planner import LearnedPlanner, input_planes, split_memory
 from mujoban_planner.play import play
@@ -323,6 +323,19 @@ def test_planner_looks_from_every_side_before_a_push_that_may_be_deadly(p_dead, 
     if looks == SYMMETRIES:
         planner.decide(state, memory)
         assert len(planner.looks) == SYMMETRIES + 1, "with the boxes where they are no side tells anything new"
+
+
+def test_a_small_doubt_about_a_push_counts_in_a_decision():
+    """What is called deadly with 0.1 % counts as 5.5 %, what is called so for certain as it is."""
+    planner, states = ResidualPlanner(8, 1, judge=True).eval(), torch.from_numpy(_states(2))
+    for p_dead, counted in ((0.001, 0.055), (0.9999, 0.9998)):
+        torch.nn.init.zeros_(planner.heads.push_dead[-1].weight)
+        torch.nn.init.constant_(planner.heads.push_dead[-1].bias, float(np.log(p_dead / (1.0 - p_dead))))
+        with torch.no_grad():
+            said = verdicts(planner(states))
+            weighed = planner.advise(states, torch.zeros(2, dtype=torch.int64)).push_alive
+        assert torch.allclose(said.exp(), torch.tensor(1.0 - p_dead), atol=1e-6)
+        assert torch.allclose(1.0 - weighed.exp(), torch.tensor(counted), atol=5e-4)
 
 
 def test_planner_that_doubts_nothing_looks_once():
