@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -167,6 +169,14 @@ def wary_verdicts(output: PlannerOutput) -> Tensor:
         return torch.zeros_like(output.push)
     factor, summand = WARINESS
     return log_alive(factor * output.push_dead + summand)
+
+
+def as_said(wary: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the verdicts as the network says them, log(1 - p(dead)), of `wary_verdicts`, of any shape."""
+    factor, summand = WARINESS
+    odds = np.maximum(-wary, np.finfo(np.float32).tiny)
+    dead = (odds + np.log(-np.expm1(-odds)) - summand) / factor  # softplus, inverted
+    return -np.logaddexp(np.float32(0.0), dead)
 
 
 def log_alive(dead: Tensor) -> Tensor:

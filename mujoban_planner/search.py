@@ -25,7 +25,7 @@ from mujoban_core.grid import CHANNELS, GRID_SIZE, Instruction
 from mujoban_planner.boards import BitBoards, state_tensor
 from mujoban_planner.forest import Forest
 from mujoban_planner.forest_kernels import region_of
-from mujoban_planner.heads import INTERIOR, verdicts
+from mujoban_planner.heads import INTERIOR, as_said, verdicts
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.shortening import shorten
 from mujoban_rl.compiled import CompiledGraph
@@ -99,7 +99,7 @@ def _judge_one(decision: CompiledGraph, state: NDArray[np.float32]) -> tuple[NDA
     nothing = np.zeros((1, len(Instruction) - 1, INTERIOR, INTERIOR), np.float32)
     seen, caution = np.zeros(1, np.int64), np.array(1.0, np.float32)
     _, push, push_alive, alive = decision([state, seen, nothing, nothing, nothing, caution])
-    return (push + push_alive).reshape(1, len(Instruction) - 1, -1), alive
+    return (push + as_said(push_alive)).reshape(1, len(Instruction) - 1, -1), alive
 
 
 class GraphedEvaluation:

@@ -12,7 +12,7 @@ from mujoban_core.files import digest
 from mujoban_planner.boards import abstract_states, bit_boards, take_levels
 from mujoban_planner.decision import count_visits, initial_means, initial_visits
 from mujoban_planner.export import export
-from mujoban_planner.networks import RecurrentPlanner
+from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner
 from mujoban_planner.play import play
 from mujoban_planner.search import evaluate_boards
 from mujoban_rl.compiled import graph_path
@@ -56,15 +56,28 @@ def test_shipped_planner_decides_in_its_graph_as_in_pytorch():
             assert all(np.allclose(x, y, atol=0.05, rtol=1e-4) for x, y in zip(a, b, strict=True))
 
 
-@pytest.mark.parametrize("views", [1, 4])
-def test_a_search_judges_one_state_by_the_graph_as_in_pytorch(views, monkeypatch):
-    compiled, plain = mujoban_planner.load(), mujoban_planner.load(compiled=False)
-    compiled.thinking = plain.thinking = views
+def _judged_alike(compiled, plain, monkeypatch):
     monkeypatch.setattr(compiled, "read", lambda state: pytest.fail("it has a graph for one state"))
     for i in range(len(LEVELS.wall)):
         boards = bit_boards(take_levels(LEVELS, np.array([i])))
         for said, expected in zip(evaluate_boards(compiled, boards), evaluate_boards(plain, boards), strict=True):
             assert np.allclose(said, expected, atol=1e-3)
+
+
+def test_a_search_judges_one_state_by_the_graph_as_in_pytorch(monkeypatch):
+    _judged_alike(mujoban_planner.load(), mujoban_planner.load(compiled=False), monkeypatch)
+
+
+@pytest.mark.parametrize("views", [1, 4])
+@pytest.mark.parametrize("judge", [True, False])
+def test_longer_thinking_that_sees_more_views_leaves_a_search_its_graph(views, judge, tmp_path, monkeypatch):
+    torch.manual_seed(0)
+    planner, path = ResidualPlanner(4, 1, judge=judge), tmp_path / "small.safetensors"
+    save_weights(path, planner, planner.config, {})
+    export(path)
+    compiled, plain = mujoban_planner.load(path), mujoban_planner.load(path, compiled=False)
+    compiled.thinking = plain.thinking = views
+    _judged_alike(compiled, plain, monkeypatch)
 
 
 def test_shipped_graph_solves_levels_one_by_one():
