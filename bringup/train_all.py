@@ -199,11 +199,13 @@ def _controller(options: Options) -> list[Stage]:
 def _planner(options: Options) -> list[Stage]:
     """Return the training of the planner, on boards in full view and as an estimator sees them."""
     product = WEIGHTS["planner"]
-    last = () if options.before is None else (*options.machine.begun_with(options.before / product), *_GENTLY)
     every = max(1, round(_seconds(options, "planner") / _PLANNER_EVALUATIONS))
     command = ("mujoban_planner.train", "expert-iteration", "--seed", str(options.stream))
     command += ("--evaluate-every", str(every))
-    begun = (*_from_before(options, "--init", "planner"), *_MINED) if options.before is not None else ()
+    begun, last = (), ()
+    if options.before is not None:
+        begun = (*_from_before(options, "--init", "planner"), *_MINED)
+        last = (*options.machine.begun_with(options.before / product), *_GENTLY)
     return [
         _trainer(
             options, "planner", (*command, *begun, *_VIEWS), product, sources=_sources(options, "planner"),

@@ -51,7 +51,7 @@ class Advice(NamedTuple):
     push: Tensor
     """Log-probability of each next push, [B, D, I, I]."""
     push_alive: Tensor
-    """log(1 - p(dead)) of each push, to the safe side (`wary_verdicts`), [B, D, I, I]; zeros for a network that does
+    """log(1 - p(dead)) of each push, to the safe side (`verdicts`), [B, D, I, I]; zeros for a network that does
     not judge pushes."""
 
 
@@ -156,23 +156,21 @@ class PoolAndInject(nn.Module):
         return self.linear(torch.cat([mean, maximum], 1))[:, :, None, None]
 
 
-def verdicts(output: PlannerOutput) -> Tensor:
-    """Return log(1 - p(dead)) of each push, [B, D, I, I]; zeros where a network does not judge pushes."""
-    if output.push_dead is None:
-        return torch.zeros_like(output.push)
-    return log_alive(output.push_dead)
+def verdicts(output: PlannerOutput, *, wary: bool = False) -> Tensor:
+    """Return log(1 - p(dead)) of each push, [B, D, I, I]; zeros where a network does not judge pushes.
 
-
-def wary_verdicts(output: PlannerOutput) -> Tensor:
-    """Return the verdicts as a decision weighs them, to the safe side, since a push can't be taken back."""
+    Args:
+        output: What the network says.
+        wary: Whether to return them as a decision weighs them, to the safe side, since a push can't be taken back.
+    """
     if output.push_dead is None:
         return torch.zeros_like(output.push)
     factor, summand = WARINESS
-    return log_alive(factor * output.push_dead + summand)
+    return log_alive(factor * output.push_dead + summand if wary else output.push_dead)
 
 
 def as_said(wary: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the verdicts as the network says them, log(1 - p(dead)), of `wary_verdicts`, of any shape."""
+    """Return the verdicts as the network says them, log(1 - p(dead)), of wary ones, of any shape."""
     factor, summand = WARINESS
     odds = np.maximum(-wary, np.finfo(np.float32).tiny)
     dead = (odds + np.log(-np.expm1(-odds)) - summand) / factor  # softplus, inverted

@@ -33,7 +33,7 @@ from mujoban_planner.decision import (
     running_mean,
     visit_penalty,
 )
-from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, Weighed, log_alive, verdicts, wary_verdicts
+from mujoban_planner.heads import Advice, PlannerHeads, PlannerOutput, Weighed, log_alive, verdicts
 from mujoban_planner.propagation import PLANES, propagate
 from mujoban_rl.compiled import Compilable
 
@@ -237,7 +237,7 @@ class LearnedPlanner(Compilable, Planner):
         """
         del seen  # a network that takes the board as it is
         output, _ = self.read(states)
-        return Advice(output.policy, log_alive(output.dead), output.push, wary_verdicts(output))
+        return Advice(output.policy, log_alive(output.dead), output.push, verdicts(output, wary=True))
 
 
 def split_memory(memory: Memory) -> tuple[VisitMemory, PushMeans]:
