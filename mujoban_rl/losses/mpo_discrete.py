@@ -12,8 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
-from torch.distributions import Categorical, kl_divergence
+from torch.distributions import Categorical
 from torch.nn import functional
 
 from mujoban_core.ranges import check_positive
@@ -71,12 +72,22 @@ class DiscreteMPO(nn.Module):
         policy = Categorical(logits=logits, validate_args=False)
         better = improve(q, prior.logits, duals["temperature"], config.epsilon, dim=1)
         cross_entropy = -(better.weights * policy.logits).sum(1).mean()
-        near = trust_region(kl_divergence(prior, policy), duals["alpha"], config.epsilon_policy)
+        near = trust_region(_divergence(prior, policy), duals["alpha"], config.epsilon_policy)
         loss = cross_entropy + near.cost + near.dual_loss + better.temperature_loss
         stats = DiscreteMPOStats(
             cross_entropy, duals["temperature"], duals["alpha"], better.kl, near.kl, policy.entropy().mean()
         )
         return loss, DiscreteMPOStats._make(value.detach() for value in stats)
+
+
+def _divergence(prior: Categorical, policy: Categorical) -> Tensor:
+    """Return KL(prior | policy), [B], from logarithms.
+
+    torch's is infinite where a probability of the policy is too small for a float32, however small that of the prior:
+    a planner's logits are 100 apart and more.
+    """
+    terms = prior.probs * (prior.logits - policy.logits)
+    return torch.where(prior.probs > 0.0, terms, 0.0).sum(1)
 
 
 def expected_value(q: Tensor, logits: Tensor) -> Tensor:

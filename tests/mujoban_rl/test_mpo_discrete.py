@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -71,6 +73,16 @@ def test_only_the_online_policy_and_the_dual_variables_are_trained():
     mpo(logits, target, q)[0].backward()
     assert logits.grad is not None and target.grad is None and q.grad is None
     assert all(variable.grad is not None for variable in mpo.duals.parameters())
+
+
+def test_policies_whose_logits_are_far_apart_are_held_together_as_others_are():
+    before = torch.tensor([[0.0, -50.0, -200.0], [0.0, 0.0, -float("inf")]])
+    logits = torch.tensor([[0.0, -150.0, -200.0], [0.0, 1.0, -float("inf")]], requires_grad=True)
+    loss, stats = DiscreteMPO()(logits, before, torch.zeros(2, 3))
+    loss.backward()
+    assert logits.grad is not None and logits.grad.isfinite().all()
+    moved = math.log((1.0 + math.e) / 2.0) - 0.5  # of two equal actions, one became e times as probable
+    assert stats.kl_policy.item() == pytest.approx(moved / 2.0 / DiscreteMPOConfig().epsilon_policy, rel=1e-4)
 
 
 def test_contradictory_configuration_is_rejected():
