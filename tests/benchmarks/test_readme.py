@@ -5,6 +5,7 @@ import re
 import pytest
 
 from benchmarks import readme
+from benchmarks.paper import runs, tables
 from benchmarks.readme import Command, Options, Source
 from benchmarks.running import ROOT
 
@@ -44,6 +45,23 @@ def test_no_line_of_the_readmes_blocks_is_left_out():
     outside = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
     assert lines == [line.strip() for line in outside.splitlines() if line.startswith("    ")]
     assert [part.name for part in parts if isinstance(part, Source)] == ["my_planner.py"]
+
+
+@pytest.mark.parametrize(
+    ("title", "row"),
+    [
+        ("all four modules learned", "default"),
+        ("the same, as nodes of the ROS graph", "graph"),
+        ("with ground truth for what is sensed", "planner_controller"),
+        ("with a perfect plan as well: the controller alone", "controller"),
+    ],
+)
+def test_the_readmes_table_says_what_was_measured_and_with_which_weights(title, row):
+    (run,) = (run for run in runs.ALL if run.name == row)
+    report = runs.load(run)
+    assert report is not None
+    stale = tables.STALE if runs.is_stale(report, run) else ""
+    assert f"| {title}{stale} | {100 * report['success_rate']:.1f} % |" in (ROOT / "README.md").read_text()
 
 
 @pytest.mark.parametrize(
