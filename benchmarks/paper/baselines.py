@@ -24,7 +24,7 @@ from benchmarks.paper.runs import ROOT, ResultError, Run
 from bringup.training_report import cost
 from mujoban_core.files import write_atomically
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_core.plugins import ROLES
+from mujoban_core.plugins import PRIVILEGED, ROLES
 from mujoban_core.program import read_options, run_command
 from mujoban_rl.metrics import mean_of
 from mujoban_sim.presets import DEFAULT_WORLD
@@ -176,9 +176,10 @@ BASELINES: Final = (
         "monolithic-mpo --levels curriculum --mpo.critic-first 1000", _NOT, cloning="clone --bags bags/stack",
     ),
     Baseline("clone", "cloning of the stack alone", _ROBOT, "bags", "clone --bags bags/stack", _NOT),
-    Baseline("vtrace", "V-trace", _ABOVE, "curriculum", f"monolithic-vtrace {_VTRACE}", _FULL),
+    Baseline("vtrace", f"V-trace{PRIVILEGED}", _ABOVE, "curriculum", f"monolithic-vtrace {_VTRACE}", _FULL),
     Baseline(
-        "structured", "structured V-trace", f"{_ABOVE}, s_abst", "curriculum", f"structured-vtrace {_VTRACE}", _FULL
+        "structured", f"structured V-trace{PRIVILEGED}", f"{_ABOVE}, s_abst", "curriculum",
+        f"structured-vtrace {_VTRACE}", _FULL,
     ),
     Baseline(
         "joint", "modular, fine-tuned as a whole", _ROBOT, "hard, from the row as it ships", "joint", _NOT,

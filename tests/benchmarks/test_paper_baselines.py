@@ -9,7 +9,8 @@ from benchmarks.paper import __main__ as results
 from benchmarks.paper import baselines, parts, runs
 from bringup import train_all
 from mujoban_baselines.train import COMMANDS, PROG
-from mujoban_core.plugins import ROLES, load_module
+from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.plugins import PRIVILEGED, ROLES, load_module
 from mujoban_core.program import read_options
 
 
@@ -157,3 +158,9 @@ def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_pat
     cells = "1.50 M | 1.0 | 0.5 | 7 days, 200 to 1,000 actors a module | 4 |" + 4 * " not measured |"
     cells += " 50.0 % (15.0 to 85.0)"
     assert f"| modular | o_cam, o_pr, o_pos | all difficulties, bottom-up ([how](../weights.md)) | {cells} |" in page
+
+
+def test_rows_of_agents_that_are_told_the_truth_say_so_in_table_and_legend():
+    for row in (*baselines.BASELINES, *baselines.AGAIN):
+        for report in filter(None, (runs.load(row.run(d)) for d in DIFFICULTIES)):
+            assert bool(report["privileged"]) == (PRIVILEGED in row.title) == (PRIVILEGED in row.label), row.name
