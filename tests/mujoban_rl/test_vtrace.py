@@ -23,6 +23,37 @@ def test_targets_equal_a_case_computed_by_hand():
     assert targets.advantage[:, 0].tolist() == pytest.approx([2.115, 0.35])
 
 
+# Three steps with weights rho, gamma 0.9: what comes back from step 2 to step 1 is cut at 1, at step 0 halved.
+RHO, REWARD, VALUE, BOOTSTRAP = column(0.5, 2.0, 1.0), column(1.0, 0.0, 2.0), column(1.0, 2.0, 0.0), torch.tensor([3.0])
+LOOSE = VTraceConfig(clip_rho=2.0, clip_c=1.0, value_weight=0.5, entropy_weight=0.1)
+
+
+def test_differences_come_back_in_time_by_the_product_of_weights():
+    targets = vtrace_targets(RHO.log(), REWARD, column(0.9, 0.9, 0.9), VALUE, BOOTSTRAP, LOOSE)
+    # delta_2 = 2 + 2.7 - 0 = 4.7, delta_1 = 2 (0 + 0 - 2) = -4, delta_0 = 0.5 (1 + 1.8 - 1) = 0.9; c = (0.5, 1, 1)
+    # v_2 = 4.7, v_1 = 2 - 4 + 0.9 * 1 * 4.7 = 2.23, v_0 = 1 + 0.9 + 0.9 * 0.5 * 0.23 = 2.0035
+    assert targets.value[:, 0].tolist() == pytest.approx([2.0035, 2.23, 4.7])
+    # 0.5 (1 + 0.9 * 2.23 - 1), 2 (0 + 0.9 * 4.7 - 2), 2 + 0.9 * 3 - 0
+    assert targets.advantage[:, 0].tolist() == pytest.approx([1.0035, 4.46, 4.7])
+
+
+def test_loss_and_gradients_equal_a_case_computed_by_hand():
+    log_prob, value, entropy, bootstrap = (
+        x.clone().requires_grad_() for x in (RHO.log(), VALUE, column(1.0, 2.0, 3.0), BOOTSTRAP)
+    )
+    nothing = torch.zeros(3, 1)
+    loss, stats = vtrace_loss(log_prob, nothing, entropy, value, bootstrap, REWARD, column(0.9, 0.9, 0.9), LOOSE)
+    loss.backward()
+    # log pi = (-ln 2, ln 2, 0); errors of the values (-1.0035, -0.23, -4.7)
+    assert stats.policy_loss.item() == pytest.approx(-(4.46 - 1.0035) * math.log(2.0) / 3)
+    assert stats.value_loss.item() == pytest.approx((1.00701225 + 0.0529 + 22.09) / 3)
+    assert loss.item() == pytest.approx(-0.798620 + 0.5 * 7.716637 - 0.1 * 2.0, abs=1e-5)
+    assert log_prob.grad[:, 0].tolist() == pytest.approx([-0.3345, -4.46 / 3, -4.7 / 3])
+    assert value.grad[:, 0].tolist() == pytest.approx([-0.3345, -0.23 / 3, -4.7 / 3], abs=1e-6)
+    assert entropy.grad[:, 0].tolist() == pytest.approx([-0.1 / 3] * 3)
+    assert bootstrap.grad is None, "what is learned towards is held"
+
+
 def test_on_policy_targets_are_discounted_returns_that_stop_at_an_episodes_end():
     reward, discount = column(1.0, 2.0, 4.0), column(0.5, 0.0, 0.5)
     nothing, last = torch.zeros(3, 1), torch.tensor([8.0])
