@@ -37,6 +37,8 @@ KINDS: Final = ("solved", "return")
 _EPISODES: Final = "episodes"
 _ENOUGH: Final = 20
 """Episodes of which a point of a drawn curve is the mean, at least: the first to end are the short, solved ones."""
+_REFUSED: Final = 0.01
+"""Share of a run's updates that may be refused; one that lost more has not had the row's budget."""
 
 
 HOURS: Final = 1.0
@@ -217,7 +219,7 @@ def read_curve(run: Path, *, cloned: bool = False) -> list[dict[str, Any]]:
             took counts as taken before the first step.
 
     Raises:
-        ResultError: If it, or such a cloning, has no metrics.
+        ResultError: If it, or such a cloning, has no metrics, or too many of its updates were refused.
     """
     if (run / "pipeline.json").exists():
         return [cost(run) | {kind: {} for kind in (*KINDS, _EPISODES)}]
@@ -261,9 +263,16 @@ def joined(points: Sequence[dict[str, Any]], kind: str, difficulty: int) -> list
 
 
 def _lines(run: Path) -> list[dict[str, Any]]:
-    if lines := read_metrics(run):
-        return lines
-    raise ResultError(f"{run}: its metrics are empty")
+    lines = read_metrics(run)
+    if not lines:
+        raise ResultError(f"{run}: its metrics are empty")
+    refused, updates = (lines[-1].get(kind) or 0.0 for kind in ("refused_updates", "updates"))
+    if refused > _REFUSED * updates:
+        raise ResultError(
+            f"{run}: {refused:,.0f} of {updates:,.0f} updates were refused, as numbers in them were not finite: "
+            f"expected at most {_REFUSED:.0%} of a run that is a row"
+        )
+    return lines
 
 
 def points_of(baseline: Baseline) -> list[dict[str, Any]]:

@@ -128,6 +128,23 @@ def test_what_a_cloning_before_took_counts(folder, tmp_path):
         baselines.main([f"mpo_cloned={tmp_path / 'run'}"])
 
 
+def test_a_run_that_was_refused_many_updates_is_no_row(folder, tmp_path):
+    def note(**refused):
+        for name, count in refused.items():
+            line = {"step": 9, "cpu_seconds": 1, "seconds": 1, "updates": 2250.0, "refused_updates": count}
+            (tmp_path / name).mkdir(exist_ok=True)
+            (tmp_path / name / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+        baselines.main([f"mpo_cloned={tmp_path / 'run'}"])
+
+    row = next(row for row in baselines.BASELINES if row.name == "mpo_cloned")
+    note(run_start=0.0, run=22.0)
+    row.curve.unlink()  # 1 % at the most: there it was
+    for refused in ({"run_start": 0.0, "run": 1087.0}, {"run_start": 1087.0, "run": 0.0}):
+        with pytest.raises(runs.ResultError, match=r"run(_start)?: 1,087 of 2,250 updates were refused"):
+            note(**refused)
+        assert not row.curve.exists()
+
+
 def test_another_seed_of_a_row_is_shown_where_it_was_measured(folder):
     assert "seed 1 |" not in results.rebuild(folder).read_text()
     again = next(row for row in baselines.AGAIN if row.name == "mpo_easy_seed1")
