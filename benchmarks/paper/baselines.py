@@ -129,9 +129,10 @@ class Baseline:
     def run(self, difficulty: int) -> Run:
         """Return its evaluation at a difficulty."""
         run = Run(f"{self.name}_{difficulty}", self.title, difficulty)
-        if self.agent:
-            return replace(run, further=("--agent", self.agent))
         folder = self.folder / self.weights
+        if self.agent:
+            trained = folder / "agent.safetensors" if self.program else None
+            return replace(run, further=("--agent", self.agent), trained=trained)
         if not self.roles:
             return replace(run, agent=folder / "agent.safetensors")
         modules = tuple((role, folder / f"{role}.safetensors") for role in self.roles)
@@ -190,7 +191,8 @@ BASELINES: Final = (
 )  # fmt: skip
 """The stack, what nobody has trained, the agents of appendix D, a monolithic one that may copy, and the stack
 fine-tuned for the task's reward."""
-JOINT: Final = BASELINES[-1]
+JOINT: Final = next(row for row in BASELINES if row.name == "joint")
+"""The stack, fine-tuned as a whole."""
 AGAIN: Final = tuple(baseline.again(1) for baseline in BASELINES[1:] if baseline.program and not baseline.agent)
 """The agents once more, with another seed; they are shown where they were measured."""
 RUNS: Final = tuple(baseline.run(d) for baseline in (*BASELINES, *AGAIN) for d in DIFFICULTIES)

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.paper.runs import ROOT, SEED, Options, Run, is_stale
+from benchmarks.paper.runs import ROOT, SEED, TRAINED, Options, Run, is_stale
 from bringup.results import EpisodeResult, Failure, report
+from mujoban_core.files import digest
 from mujoban_core.reports import noted_uses, write_report
 
 PARTS: Final = ROOT / "runs" / "paper"
@@ -48,6 +49,12 @@ class Part:
         """Have it measured anew; that its levels were used stays noted."""
         if uses := noted_uses(self.file):
             write_report({"episodes": [], "test_uses": uses}, self.file)
+
+    def note_trained(self) -> None:
+        """Note which weights an agent that is given by its name has loaded by itself, if it is one that does."""
+        if self.run.trained is not None:
+            content = json.loads(self.file.read_text())
+            write_report({**content, TRAINED: digest(self.run.trained)}, self.file)
 
     def start(self) -> subprocess.Popen[bytes]:
         """Measure it in a process of its own."""
@@ -89,6 +96,7 @@ def evaluate(run: Run, options: Options) -> None:
                 if process.returncode != 0:
                     raise ValueError(f"{run.name}: evaluate.py ended with status {process.returncode}; see "
                                      f"{part.file.with_suffix('.log')}")  # fmt: skip
+                part.note_trained()
                 _tell(run, parts, options.episodes, start, len(waiting) + len(running))
     finally:
         for _, process in running:
@@ -120,7 +128,8 @@ def _common(run: Run, reports: list[dict[str, Any]]) -> dict[str, Any]:
     Raises:
         ValueError: If they were played otherwise than each other.
     """
-    said = [{key: content[key] for key in ("body", "world", "played") if key in content} for content in reports]
+    shared = ("body", "world", "played", TRAINED)
+    said = [{key: content[key] for key in shared if key in content} for content in reports]
     for entry in said:
         if "played" in entry:
             entry["played"] = {**entry["played"], "seed": SEED}  # of the first part

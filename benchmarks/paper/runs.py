@@ -28,6 +28,8 @@ EPISODES: Final = 512
 """Levels of an evaluation (paper C.5)."""
 DIGEST_LENGTH: Final = 64
 """Characters of a digest of weights; what is shorter names a class that stands in."""
+TRAINED: Final = "trained"
+"""In a report: digest of the weights that an agent which was given by its name had loaded by itself."""
 EXPLORING: Final = "python -m mujoban_planner.train explorer --run runs/explorer"
 """Trains the scout that says where to look."""
 SCOUT_FOLDER: Final = "docs/research/explorer"
@@ -57,6 +59,8 @@ class Run:
     """Roles of modules, and weights other than those that ship which play them."""
     further: tuple[str, ...] = ()
     """Further options of `bringup/evaluate.py`."""
+    trained: Path | None = None
+    """Weights that an agent which is given by its name loads by itself."""
     training: str = ""
     """Command that trains the weights that do not ship; of agents, Table 1's page has it."""
 
@@ -72,7 +76,8 @@ class Run:
 
     def missing_weights(self) -> Path | None:
         """Return where weights that are trained apart from the stack's should be and are not."""
-        return next((path for path in self.own.values() if not path.is_file()), None)
+        apart = (*self.own.values(), *filter(None, [self.trained]))
+        return next((path for path in apart if not path.is_file()), None)
 
     @property
     def own(self) -> dict[str, Path]:
@@ -170,6 +175,9 @@ def is_stale(report: dict[str, Any], run: Run | None = None) -> bool:
     """
     body, own = (None, {}) if run is None else (run.body, run.own)
     current = {role: shipped_weights(role, body) for role in ROLES} | own
+    trained = None if run is None else run.trained
+    if trained is not None and trained.is_file() and report.get(TRAINED) != digest(trained):
+        return True
     told = {role: name.removesuffix(PRIVILEGED) for role, name in report["weights"].items() if role in current}
     return any(
         len(name) == DIGEST_LENGTH and current[role].is_file() and name != digest(current[role])

@@ -82,12 +82,14 @@ def test_every_row_is_trained_by_a_command_that_exists_with_the_same_budget(fold
             if row is baselines.MODULAR:
                 assert program == train_all.PROG and read_options(train_all.Options, arguments, PROG).hours == 1.0
                 continue
+            if row.program != PROG:  # somebody's own, which knows what options it has
+                continue
             options = read_options(COMMANDS, arguments, PROG)
             assert program == PROG and isinstance(options, COMMANDS[arguments[0]])
             assert options.config.seed == row.seed and options.run.name.startswith(row.name)
             steps, cpu_seconds = steps + options.config.steps, cpu_seconds + options.config.cpu_seconds
         whole = pytest.approx((baselines.steps(), 7200.0), abs=1.0)
-        assert row is baselines.MODULAR or row.agent or (steps, cpu_seconds) == whole
+        assert row.program != PROG or (steps, cpu_seconds) == whole
 
 
 def test_table_1_has_a_floor_that_is_measured_without_a_training(folder, monkeypatch):

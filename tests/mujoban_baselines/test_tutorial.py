@@ -1,23 +1,36 @@
 """The agents of docs/baselines.md work as printed, and its commands exist."""
 
+import json
 import re
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from paper_pages import write
 
-from benchmarks.paper import baselines, table1
+from benchmarks.paper import __main__ as results
+from benchmarks.paper import baselines, figures, parts, runs, table1, tables
 from bringup.evaluate import evaluate
 from mujoban_baselines.mpo import MPOTrainingConfig
 from mujoban_baselines.task import TaskConfig
 from mujoban_baselines.train import COMMANDS, MPORunConfig, main, mpo_parts
 from mujoban_core.agent import AgentPolicy
+from mujoban_core.files import digest
 from mujoban_core.plugins import load_module
 from mujoban_rl.actors import ActorOptions
 from mujoban_sokoban.episodes import Episodes
 
 GUIDE = (Path(__file__).parents[2] / "docs" / "baselines.md").read_text()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder in the place of that of the results, without any."""
+    monkeypatch.setattr(runs, "JSON", tmp_path / "json")
+    monkeypatch.setattr(parts, "PARTS", tmp_path / "parts")
+    (tmp_path / "json").mkdir()
+    return tmp_path
 
 
 @pytest.fixture
@@ -74,6 +87,41 @@ def test_the_row_of_the_tutorial_is_trained_by_its_program_and_played_by_its_age
     assert train.products == (Path("runs/baselines/map_agent/agent.safetensors"),)
     assert note.products == (row.curve,) and levels.needs == (train.name, note.name)
     assert row.run(5).further == ("--agent", "my_map_agent:trained")
+
+
+def test_the_row_of_the_tutorial_and_its_curve_are_on_the_page(folder, tmp_path, monkeypatch):
+    (text,) = re.findall(r'    Baseline\(\n        "map_agent".*?\n    \)', GUIDE, re.DOTALL)
+    row = eval(text.strip(), vars(baselines))
+    rows = (*baselines.BASELINES, row)
+    for module in (baselines, tables, figures, results):
+        monkeypatch.setattr(module, "BASELINES", rows)
+    drawn = []
+    monkeypatch.setattr(figures.Figure, "legend", lambda _, handles, labels, **__: drawn.extend(labels))
+    monkeypatch.setattr(baselines, "ROOT", tmp_path)
+    run = tmp_path / "runs" / "baselines" / "map_agent"
+    run.mkdir(parents=True)
+    counts = {"solved/1_n": 30, "return/1_n": 30}
+    line = {"step": 2_000_000, "cpu_seconds": 3600, "seconds": 1800, "solved/1": 0.5, "return/1": 5.5, **counts}
+    (run / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    weights = run / "agent.safetensors"
+    assert row.run(1).missing_weights() == weights
+    weights.write_bytes(b"once")
+    assert baselines.main([f"map_agent={run}"]) == 0
+    write(row.run(1), 3, 4, {"agent": "my_map_agent:trained (privileged)"})
+    measured = json.loads(row.run(1).file.read_text()) | {runs.TRAINED: digest(weights)}
+    row.run(1).file.write_text(json.dumps(measured))
+    cells = "| 2.00 M | 1.0 | 0.5 | not there | 4 | 75.0 % (30.1 to 95.4)"
+    page = page_of(folder)
+    assert f"| V-trace on the map (privileged) | o_pr, o_pos, s_abst | easy {cells} |" in page
+    assert f"    {row.commands[0]}\n" in page and baselines.JOINT.name == "joint"
+    assert drawn[-1] == "V-trace on the map (privileged) (easy)" and (folder / "baselines.png").exists()
+    assert runs.is_current(row.run(1), 4)
+    weights.write_bytes(b"again")
+    assert f"{cells}{tables.STALE} |" in page_of(folder) and not runs.is_current(row.run(1), 4)
+
+
+def page_of(folder):
+    return results.rebuild(folder).read_text()
 
 
 def test_every_command_of_the_guide_is_one():
