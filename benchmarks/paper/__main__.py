@@ -67,6 +67,12 @@ its modules the controller is the one that solved the most validation levels, th
 weights; the senses, all agents and the stack fine-tuned as a whole are as their training left them. Agents that learn
 by MPO or cloning are of size S.
 """
+CURVES = """In training, with exploration; agents that learn by MPO with a limit of 45 s. Bars are 95 % intervals
+(Wilson) of the episodes that ended since the point before. What ended before each robot had played for the time limit
+is left out: all begin at once, and the first to end are those that were solved soon. A row that trains on one
+difficulty has a curve of that one, and a point is of 20 episodes at least. The modular row's learning is in Figure 4,
+module by module; cloning plays nothing while it learns.
+"""
 FIGURE_2 = """At every difficulty by the planner's policy alone, and as by default, with its search ahead.
 """
 FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
@@ -168,8 +174,7 @@ def _figure_2(folder: Path) -> list[str]:
 
 def _baseline_curves(folder: Path) -> list[str]:
     if figures.baseline_curves(folder / "baselines.png"):
-        text = "In training, with exploration; agents that learn by MPO with a limit of 45 s:\n"
-        return [text, "![Learning curves of agents](baselines.png)\n"]
+        return [CURVES, "![Learning curves of agents](baselines.png)\n"]
     return _missing("The curves of agents", "python -m benchmarks.paper.baselines NAME=RUN")
 
 

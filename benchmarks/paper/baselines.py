@@ -4,12 +4,14 @@
     python -m benchmarks.paper.runs --only mpo_easy_1 mpo_easy_5                  # evaluate its weights
 
 The first writes `baseline_<name>.jsonl`, an object a line with `step`, `cpu_seconds`, `seconds` of wall-clock, and
-`solved` and `return` of the episodes that were played in training and their number, `episodes`, by difficulty.
+`solved` and `return` of the episodes that were played in training and their number, `episodes`, by difficulty. What
+ended before each robot had played for the longest episode says nothing of the others, and is left out.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,10 +24,12 @@ from benchmarks.paper import runs as sources
 from benchmarks.paper.curves import read_metrics
 from benchmarks.paper.runs import ROOT, ResultError, Run
 from bringup.training_report import cost
+from mujoban_baselines.task import TaskConfig
 from mujoban_core.files import write_atomically
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import PRIVILEGED, ROLES
 from mujoban_core.program import read_options, run_command
+from mujoban_core.stats import wilson_interval
 from mujoban_rl.metrics import mean_of
 from mujoban_sim.presets import DEFAULT_WORLD
 
@@ -36,7 +40,9 @@ KINDS: Final = ("solved", "return")
 """What a curve tells of the episodes of each difficulty, in the mean."""
 _EPISODES: Final = "episodes"
 _ENOUGH: Final = 20
-"""Episodes of which a point of a drawn curve is the mean, at least: the first to end are the short, solved ones."""
+"""Episodes of which a point of a drawn curve is the mean, at least."""
+ORIGINS: Final = "origins"
+"""In the last point of a row that began with weights of modules: the digest of each, by its role."""
 _REFUSED: Final = 0.01
 """Share of a run's updates that may be refused; one that lost more has not had the row's budget."""
 
@@ -225,20 +231,61 @@ def read_curve(run: Path, *, cloned: bool = False) -> list[dict[str, Any]]:
     """
     if (run / "pipeline.json").exists():
         return [cost(run) | {kind: {} for kind in (*KINDS, _EPISODES)}]
-    lines = _lines(run)
+    lines, config = _lines(run), _config(run)
     before = _lines(run.with_name(run.name + _START))[-1] if cloned else {}
     points = []
-    for part in np.array_split(np.array(lines, object), min(len(lines), _MOST)):
+    for part, whole in _stretches(lines, _episode_steps(config)):
         spent = ("step", "cpu_seconds", "seconds")
         point: dict[str, Any] = {kind: round((part[-1].get(kind) or 0) + before.get(kind, 0)) for kind in spent}
         for kind in KINDS:
-            found = {str(d): mean_of(part, [f"{kind}/{d}"]) for d in DIFFICULTIES}
+            found = {str(d): mean_of(part if whole else (), [f"{kind}/{d}"]) for d in DIFFICULTIES}
             means = {d: mean for d, mean in found.items() if mean is not None}
             point[kind] = {d: round(mean, 4) for d, (mean, _) in means.items()}
             # Of every kind the same: an episode that ends has both.
             point[_EPISODES] = {d: round(count) for d, (_, count) in means.items()}
         points.append(point)
+    if isinstance(start := config.get("origins"), dict):
+        points[-1][ORIGINS] = start
     return points
+
+
+def _config(run: Path) -> dict[str, Any]:
+    """Return the configuration of a run; nothing where it is not there."""
+    file = run / "config.json"
+    return json.loads(file.read_text()) if file.exists() else {}
+
+
+def _episode_steps(config: dict[str, Any]) -> int:
+    """Return the environment steps in which each robot of a run has played its longest episode; 0: it plays none.
+
+    A row of Table 1 has one actor, in whose robots all steps are taken.
+    """
+    if "task" not in config:
+        return 0
+    task = TaskConfig(**config["task"])
+    return task.robots * task.steps
+
+
+def _stretches(lines: Sequence[dict[str, Any]], longest: int) -> list[tuple[Sequence[dict[str, Any]], bool]]:
+    """Return stretches of lines, at most `_MOST` and perhaps two more, and whether all episodes show in them alike.
+
+    All robots begin at the same time, and those that time out go on doing so together: in what is shorter than the
+    longest episode, or not a multiple of it, are too few of those that were not solved, or too many. So a stretch ends
+    where each robot has come by a whole number of such episodes; the first, and what is left at the end, do not count.
+
+    Args:
+        lines: Of the metrics.
+        longest: Steps of all robots together in which one episode after the other ends by its time limit; 0: any.
+    """
+    if not longest:
+        parts = np.array_split(np.array(lines, object), min(len(lines), _MOST))
+        return [(list(part), True) for part in parts]
+    steps = np.array([line["step"] for line in lines])
+    together = longest * max(1, math.ceil((steps[-1] / longest - 1) / _MOST))
+    # The line in which an episode ends may be one of steps after it.
+    edges = np.searchsorted(steps, np.arange(longest, steps[-1] + 1, together)) + 1
+    parts = [part for part in np.split(np.array(lines, object), edges) if len(part)]
+    return [(list(part), 0 < i < len(edges)) for i, part in enumerate(parts)]
 
 
 def joined(points: Sequence[dict[str, Any]], kind: str, difficulty: int) -> list[tuple[int, float]]:
@@ -251,16 +298,31 @@ def joined(points: Sequence[dict[str, Any]], kind: str, difficulty: int) -> list
         kind: One of `KINDS`.
         difficulty: 1 to 5.
     """
+    return [(step, mean) for step, mean, _ in _joined(points, kind, difficulty)]
+
+
+def solved_margins(points: Sequence[dict[str, Any]], difficulty: int) -> list[tuple[float, float]]:
+    """Return how far the 95 % Wilson intervals of what `joined` says of `solved` reach below and above each point."""
+    margins = []
+    for _, mean, count in _joined(points, "solved", difficulty):
+        low, high = wilson_interval(round(mean * count), count)
+        # Means are noted with four digits.
+        margins.append((max(mean - low, 0.0), max(high - mean, 0.0)))
+    return margins
+
+
+def _joined(points: Sequence[dict[str, Any]], kind: str, difficulty: int) -> list[tuple[int, float, int]]:
+    """Return steps, means and numbers of episodes."""
     d = str(difficulty)
-    curve: list[tuple[int, float]] = []
-    total = episodes = 0
+    curve: list[tuple[int, float, int]] = []
+    total, episodes = 0.0, 0
     for point in points:
         count = point[_EPISODES].get(d, 0)
         total += count * point[kind].get(d, 0.0)
         episodes += count
         if episodes >= _ENOUGH:
-            curve.append((point["step"], total / episodes))
-            total = episodes = 0
+            curve.append((point["step"], total / episodes, episodes))
+            total, episodes = 0.0, 0
     return curve
 
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.paper import runs as sources
-from benchmarks.paper.baselines import AGAIN, BASELINES, KINDS, joined, points_of
+from benchmarks.paper.baselines import AGAIN, BASELINES, KINDS, joined, points_of, solved_margins
 from benchmarks.paper.curves import MODULES
 from benchmarks.paper.runs import ResultError, Run, is_stale, load
 from mujoban_core.grid import DIFFICULTIES
@@ -104,7 +104,8 @@ def save_rates(figure: Figure, axes: Axes, file: Path) -> None:
 def baseline_curves(file: Path) -> bool:
     """Draw success and return of the baselines in training against steps; return False when there is no curve.
 
-    Of the modular row there is what it cost alone: none of its modules plays whole levels while it is trained.
+    Of the modular row there is what it cost alone: none of its modules plays whole levels while it is trained. Bars
+    of success are 95 % Wilson intervals.
     """
     rows = ((row, points_of(row)) for row in (*BASELINES, *AGAIN))
     found = [(row, points) for row, points in rows if any(point["solved"] for point in points)]
@@ -117,7 +118,8 @@ def baseline_curves(file: Path) -> bool:
         for axes, d in zip(line, DIFFICULTIES, strict=True):
             for row, points in found:
                 steps, means = np.reshape(joined(points, kind, d), (-1, 2)).T
-                axes.plot(steps / 1e6, means, marker=".", markersize=4, label=row.label)
+                bars = np.reshape(solved_margins(points, d), (-1, 2)).T if kind == "solved" else None
+                axes.errorbar(steps / 1e6, means, yerr=bars, capsize=2, marker=".", markersize=4, label=row.label)
             axes.grid(alpha=0.3)
         line[0].set(ylabel=kind, ylim=(0.0, None))
     for axes, d in zip(panels[0], DIFFICULTIES, strict=True):

@@ -12,6 +12,7 @@ from mujoban_baselines.train import COMMANDS, PROG
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import PRIVILEGED, ROLES, load_module
 from mujoban_core.program import read_options
+from mujoban_core.stats import wilson_interval
 
 
 def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, monkeypatch):
@@ -49,6 +50,33 @@ def test_a_point_of_a_drawn_curve_is_of_many_episodes():
     points.insert(1, {"step": 150, "solved": {}, "episodes": {}})  # none of difficulty 1 ended
     assert baselines.joined(points, "solved", 1) == [(200, pytest.approx(0.8)), (300, pytest.approx(0.1))]
     assert baselines.joined(points, "solved", 2) == []
+
+
+def test_a_curve_counts_no_episodes_but_of_whole_spans_of_the_longest_one(tmp_path):
+    """Two robots, 90 ticks at the most: one solves in 30 ticks what it plays, the other never any of it."""
+    task = {"levels": "easy", "episode_seconds": 4.5, "robots": 2, "body": "ball", "world": "reference"}
+    (tmp_path / "config.json").write_text(json.dumps({"task": task}))
+    lines = []
+    for tick in range(30, 481, 30):  # a line each time that an episode ends, a step after that
+        outcomes = [1.0] + [0.0] * (tick % 90 == 0)
+        said = {f"{kind}/1": scale * sum(outcomes) / len(outcomes) for kind, scale in (("solved", 1), ("return", 11))}
+        counts = {f"{kind}/1_n": len(outcomes) for kind in ("solved", "return")}
+        lines.append({"step": 2 * tick + 2, "cpu_seconds": tick, "seconds": tick, **said, **counts})
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    points = baselines.read_curve(tmp_path)
+    assert [(point["step"], point["episodes"].get("1", 0)) for point in points] == [
+        (182, 0), (362, 4), (542, 4), (722, 4), (902, 4), (962, 0)
+    ]  # fmt: skip
+    assert all(point["solved"] == {"1": 0.75} and point["return"] == {"1": 8.25} for point in points[1:-1])
+    assert points[-1]["cpu_seconds"] == 480, "what it cost is of the whole run"
+
+
+def test_bars_of_a_curve_are_intervals_of_its_episodes():
+    points = [{"step": 1, "solved": {"1": 0.75}, "episodes": {"1": 20}}]
+    ((below, above),) = baselines.solved_margins(points, 1)
+    low, high = wilson_interval(15, 20)
+    assert (below, above) == pytest.approx((0.75 - low, high - 0.75))
+    assert baselines.solved_margins(points, 2) == []
 
 
 def test_the_modular_row_has_a_cost_and_no_curve(folder):
