@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.paper import baselines, bodies, curves, figures, film, tables
-from benchmarks.paper.baselines import AGAIN, BASELINES, HOURS, JOINT, RECORDING
+from benchmarks.paper.baselines import AGAIN, BASELINES, HOURS, RECORDING
 from benchmarks.paper.runs import (
     AHEAD,
     ALL,
@@ -124,8 +124,7 @@ def rebuild(folder: Path) -> Path:
         tables.commands(AGAIN),
         "</details>\n",
         EQUAL,
-        "Why episodes of difficulty 5 fail, before fine-tuning as a whole and after:\n",
-        tables.failures((POLICY_ALONE[0], JOINT.run(POLICY_ALONE[0].difficulty))),
+        tables.fine_tuned(),
         *_baseline_curves(folder),
         "## Table 2: module evaluation\n",
         TABLE_2,

@@ -7,10 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.paper.baselines import AGAIN, BASELINES, MODULAR, Baseline, points_of
-from benchmarks.paper.runs import DIFFICULTY, Run, distinct, is_stale, load
+from benchmarks.paper.baselines import AGAIN, BASELINES, JOINT, MODULAR, ORIGINS, Baseline, points_of
+from benchmarks.paper.runs import DIFFICULTY, POLICY_ALONE, Run, distinct, is_stale, load
 from bringup.results import Failure
 from mujoban_core.grid import DIFFICULTIES
+from mujoban_core.plugins import ROLES
 from mujoban_core.reports import count_uses
 
 STALE = " †"
@@ -36,12 +37,31 @@ def failures(runs: Sequence[Run]) -> str:
     reports = [load(run) for run in runs]
     reasons = sorted({reason for report in reports if report for reason in report["failures"]})
     rows = [
-        [run.title, *(str(report["failures"].get(reason, 0)) for reason in reasons)]
+        [_title(run, report), *(str(report["failures"].get(reason, 0)) for reason in reasons)]
         for run, report in zip(runs, reports, strict=True)
         if report
     ]
     meant = "; ".join(f"*{reason}*, {Failure(reason).meaning}" for reason in reasons)
     return _table(["configuration", *reasons], rows) + (f"\nCauses: {meant}.\n" if meant else "")
+
+
+def fine_tuned() -> str:
+    """Return why the stack fails before it is fine-tuned as a whole and after, where there is that to compare.
+
+    What is compared is the fine-tuned stack and that from which it came: where the row before was played with other
+    weights than those from which the tuning began, as the run that was noted says, the two tell nothing of it.
+    """
+    before, after = POLICY_ALONE[0], JOINT.run(POLICY_ALONE[0].difficulty)
+    reports, points = (load(before), load(after)), points_of(JOINT)
+    began = points[-1].get(ORIGINS) if points else None
+    if None in reports or began is None:
+        return ""
+    played, tuned = (report["weights"] for report in reports if report)
+    kept = ROLES.keys() - dict(after.modules)
+    if any(played.get(role) != began[role] for role in ROLES) or any(tuned.get(role) != began[role] for role in kept):
+        return ""
+    head = f"Why episodes of difficulty {before.difficulty} fail, before fine-tuning as a whole and after:\n\n"
+    return head + failures((before, after))
 
 
 def privileged(run: Run, report: dict[str, Any]) -> str:
@@ -133,6 +153,10 @@ def _rates(runs: Sequence[Run]) -> list[str]:
     return ["/".join(map(str, sorted(counts))) or "0", *cells]
 
 
+def _title(run: Run, report: dict[str, Any]) -> str:
+    return run.title + (STALE if is_stale(report, run) else "")
+
+
 def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
     name, oracles = f"`{run.name}`", ", ".join(run.oracle) or "none"
     paper = [MISSING if run.paper_success is None else f"{100 * run.paper_success:.1f} %"]
@@ -145,7 +169,7 @@ def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
     error = returns.std(ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else float("nan")
     low, high = report["success_interval"]
     return [
-        run.title + (STALE if is_stale(report, run) else ""),
+        _title(run, report),
         name,
         oracles,
         str(len(returns)),

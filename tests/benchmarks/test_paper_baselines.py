@@ -6,11 +6,12 @@ import pytest
 from paper_pages import write
 
 from benchmarks.paper import __main__ as results
-from benchmarks.paper import baselines, parts, runs
+from benchmarks.paper import baselines, parts, runs, tables
 from bringup import train_all
 from mujoban_baselines.train import COMMANDS, PROG
+from mujoban_core.files import digest
 from mujoban_core.grid import DIFFICULTIES
-from mujoban_core.plugins import PRIVILEGED, ROLES, load_module
+from mujoban_core.plugins import PRIVILEGED, ROLES, load_module, shipped_weights
 from mujoban_core.program import read_options
 from mujoban_core.stats import wilson_interval
 
@@ -92,12 +93,42 @@ def test_the_fine_tuned_stack_has_a_row_and_its_failures_beside_what_it_came_fro
     options = run.options()
     for role in ("controller", "planner"):
         assert options[options.index(f"--{role}") + 1] == str(runs.ROOT / f"runs/baselines/joint/{role}.safetensors")
-    write(runs.POLICY_ALONE[0], 3, 4, {})
-    write(run, 2, 4, {})
+    began = {role: digest(shipped_weights(role)) for role in ROLES}
+    after = {**began, "controller": "1" * 64, "planner": "2" * 64}
+    note_a_joint_run(folder, began)
+    write(runs.POLICY_ALONE[0], 3, 4, began)
+    write(run, 2, 4, after)
     page = results.rebuild(folder).read_text()
     assert "| modular, fine-tuned as a whole | o_cam, o_pr, o_pos |" in page and "50.0 % (15.0 to 85.0)" in page
     failures = page.split("before fine-tuning as a whole and after")[1].split("##")[0]
     assert "| default, the planner's policy alone |" in failures and "| modular, fine-tuned as a whole |" in failures
+
+
+def note_a_joint_run(folder, began):
+    run = folder / "run"
+    run.mkdir(exist_ok=True)
+    (run / "metrics.jsonl").write_text('{"step": 9, "cpu_seconds": 1, "seconds": 1}\n')
+    (run / "config.json").write_text(json.dumps({"origins": began}))
+    assert baselines.main([f"joint={run}"]) == 0
+
+
+def test_failures_of_the_fine_tuned_stack_are_compared_with_what_it_came_from_alone(folder):
+    def told(before, tuned):
+        write(runs.POLICY_ALONE[0], 3, 4, before)
+        write(baselines.JOINT.run(5), 2, 4, tuned)
+        return tables.fine_tuned()
+
+    then = {role: str(i) * 64 for i, role in enumerate(ROLES)}
+    after = {**then, "controller": "8" * 64, "planner": "9" * 64}
+    assert told(then, after) == "", "nobody has noted what it began with"
+    note_a_joint_run(folder, then)
+    compared = told(then, after)
+    assert f"| default, the planner's policy alone{tables.STALE} |" in compared, "other weights ship by now"
+    for role in ROLES:
+        assert told({**then, role: "7" * 64}, after) == "", f"another {role} before"
+    assert told(then, {**after, "estimator": "7" * 64}) == "", "another estimator after"
+    baselines.JOINT.run(5).file.unlink()
+    assert tables.fine_tuned() == ""
 
 
 def test_every_row_is_trained_by_a_command_that_exists_with_the_same_budget(folder):
