@@ -23,7 +23,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 RESULTS: Final = ROOT / "docs" / "results"
 JSON: Final = RESULTS / "json"
 SEED: Final = 4_000_000
-"""Seed of the first of the 512 levels that no training saw (paper C.5), and by which nothing was chosen: test seeds."""
+"""Seed of the first of the 512 levels that no training saw (paper C.5): test seeds."""
 EPISODES: Final = 512
 """Levels of an evaluation (paper C.5)."""
 DIGEST_LENGTH: Final = 64

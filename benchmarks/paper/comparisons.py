@@ -1,0 +1,143 @@
+"""What Table 1 says of difficulty 1, where a level comes under many seeds: intervals, and who is above the floor.
+
+Outcomes of one level depend on each other. Errors are those of sums over distinct levels: what each of them adds to a
+rate, or to the difference of two, is one draw.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+from benchmarks.paper.baselines import AGAIN, BASELINES, HOURS, MODULAR, Baseline, points_of, steps
+from benchmarks.paper.runs import load
+from mujoban_core.stats import wilson_interval
+from mujoban_sokoban.generator import generate_level
+
+_FLOOR: Final = "untrained"
+"""The row that the others are compared with."""
+_EASIEST: Final = 1
+"""The difficulty whose levels come again, and the one at which agents differ."""
+_Z: Final = 1.959963984540054
+"""Of 95 %."""
+
+
+class Difference(NamedTuple):
+    """Success of one row less that of another, with its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def interval(episodes: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
+    """Return the 95 % Wilson interval of a success rate, wider by the design effect of levels that come again.
+
+    Args:
+        episodes: `seed` and `solved` of each, at difficulty 1.
+    """
+    solved, n = sum(entry["solved"] for entry in episodes), len(episodes)
+    rate, shares = solved / n, _shares(episodes)
+    simple = rate * (1.0 - rate) / n
+    # Where all end alike nothing is known of how much copies differ: as if they did not.
+    effect = max(1.0, _variance(shares.values()) / simple) if simple else n / len(shares)
+    return wilson_interval(solved, n, _Z * math.sqrt(effect))
+
+
+def difference(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[str, Any]]) -> Difference:
+    """Return the difference of two success rates; levels that both have are compared with each other.
+
+    Args:
+        first: `seed` and `solved` of each episode, at difficulty 1.
+        second: The same of the row that is subtracted.
+    """
+    ours, theirs = _shares(first), _shares(second)
+    mean = sum(e["solved"] for e in first) / len(first) - sum(e["solved"] for e in second) / len(second)
+    apart = [ours.get(level, 0.0) - theirs.get(level, 0.0) for level in ours.keys() | theirs.keys()]
+    half = _Z * math.sqrt(_variance(apart))
+    return Difference(mean, mean - half, mean + half)
+
+
+def _shares(episodes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return by how much the outcomes on each distinct level move the rate from where it is."""
+    rate = sum(entry["solved"] for entry in episodes) / len(episodes)
+    shares: dict[str, float] = defaultdict(float)
+    for entry in episodes:
+        shares[_level(entry["seed"])] += (entry["solved"] - rate) / len(episodes)
+    return shares
+
+
+def _variance(shares: Iterable[float]) -> float:
+    """Return the variance of the sum of independent shares whose mean is 0."""
+    found = list(shares)
+    return sum(share**2 for share in found) * len(found) / max(len(found) - 1, 1)
+
+
+@cache
+def _level(seed: int) -> str:
+    return generate_level(_EASIEST, seed).to_text()
+
+
+def _measured() -> list[tuple[Baseline, list[dict[str, Any]]]]:
+    """Return rows whose difficulty 1 has been measured, with its episodes."""
+    reports = ((row, load(row.run(_EASIEST))) for row in (*BASELINES, *AGAIN))
+    return [(row, report["episodes"]) for row, report in reports if report]
+
+
+def distinct_levels() -> str:
+    """Return how many test levels of difficulty 1 there are, and intervals to go with it; nothing without rows."""
+    rows = _measured()
+    if not rows:
+        return ""
+    played = {entry["seed"] for _, episodes in rows for entry in episodes}
+    found = ((row.label, interval(episodes)) for row, episodes in rows)
+    told = "; ".join(f"{label}, {100 * low:.1f} to {100 * high:.1f} %" for label, (low, high) in found)
+    return (
+        f"Of the {len(played)} test levels of difficulty 1 {len(set(map(_level, played)))} are distinct, and all are "
+        "among 10,000 levels for training ([levels](../levels.md#the-five-difficulties)): the column says how well "
+        "levels were learned that can be met in training, not how agents do on others. With copies of a level as one "
+        f"draw (Wilson intervals, wider by the design effect), its 95 % intervals are: {told}.\n"
+    )
+
+
+def against_floor() -> str:
+    """Return which rows differ from what nobody has trained, at difficulty 1; nothing while that is not measured."""
+    rows = _measured()
+    floor = next(((row, episodes) for row, episodes in rows if row.name == _FLOOR), None)
+    if floor is None:
+        return ""
+    groups: dict[str, list[str]] = {"above it": [], "below it": [], "not told apart from it": []}
+    for row, episodes in rows:
+        if row is floor[0]:
+            continue
+        mean, low, high = difference(episodes, floor[1])
+        group = "above it" if low > 0.0 else "below it" if high < 0.0 else "not told apart from it"
+        groups[group].append(f"{row.label}, {100 * mean:+.1f} ({100 * low:.1f} to {100 * high:.1f})")
+    told = " ".join(f"{group[0].upper()}{group[1:]}: {'; '.join(named) or 'none'}." for group, named in groups.items())
+    return (
+        f"Against the floor, *{floor[0].title}*, at difficulty 1, in points of success with 95 % intervals (normal; "
+        f"outcomes on the same seeds paired, errors clustered by distinct level; each row by itself): {told}\n"
+    )
+
+
+def ended_by_steps() -> str:
+    """Return how much of their CPU time the rows used that were ended by their steps; nothing where there are none."""
+    budget = 2 * 3600 * HOURS
+    costs = [points[-1] for row in (*BASELINES, *AGAIN) if row is not MODULAR and (points := points_of(row))]
+    ended = [cost for cost in costs if cost["step"] >= steps() and cost["cpu_seconds"] < budget]
+    shares = [cost["cpu_seconds"] / budget for cost in ended]
+    if not shares:
+        return ""
+    least, most = (f"{100 * share:.0f}" for share in (min(shares), max(shares)))
+    spent = least if least == most else f"{least} to {most}"
+    return f"Rows that were ended by their steps used {spent} % of their CPU time.\n"
+
+
+def seeds() -> str:
+    """Return of which seeds the rows are."""
+    again = [row.label for row in AGAIN if points_of(row)]
+    others = "; ".join(again) or "none"
+    return f"A row is one run, of seed 0 where it names no other. Of another seed were run: {others}.\n"
