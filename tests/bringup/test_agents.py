@@ -5,13 +5,16 @@ import json
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+import torch
 
 from bringup import run_stack
 from bringup.command import Choice, Solo
 from bringup.evaluate import evaluate, main
 from bringup.results import Failure
 from bringup.stack import PlayOptions, play
+from mujoban_baselines.agents import StructuredAgent, playing, untrained
 from mujoban_baselines.random_agent import RandomAgent
+from mujoban_baselines.repeat import Repeating
 from mujoban_core.agent import Agent, AgentInput, AgentPolicy
 from mujoban_core.bodies import BODIES
 from mujoban_core.interfaces import GroundTruth, Observation
@@ -141,6 +144,44 @@ def test_an_agent_plays_through_the_graph_as_it_does_in_a_rollout():
         outcome = play(solo, episodes, PlayOptions(time_limit=25))
         assert outcome.results == evaluate(solo.policy(), episodes, time_limit=25)
         assert outcome.ticks == 50 and not any("foreign" in event for event in outcome.counts)
+
+
+@pytest.mark.parametrize("name", ["untrained", "structured"])
+def test_noise_subgoals_and_torques_that_are_held_are_in_the_graph_what_they_are_in_a_rollout(name):
+    solo, episodes = Solo(Choice.parse("agent", f"{__name__}:noted_{name}")), Episodes(2, 3, difficulty=1)
+    TORQUES.clear()
+    played = play(solo, episodes, PlayOptions(time_limit=25)).results
+    in_graph = np.concatenate(TORQUES)
+    TORQUES.clear()
+    assert played == evaluate(solo.policy(), episodes, batch=1, time_limit=25)
+    in_rollout = np.concatenate(TORQUES)
+    np.testing.assert_allclose(in_graph, in_rollout, atol=1e-4)
+    assert (in_rollout[:4] == in_rollout[0]).all() and np.unique(in_rollout, axis=0).shape == (14, 2)
+
+
+TORQUES = []
+
+
+class Noted(Repeating):
+    """Notes what it says."""
+
+    def step(self, inputs, state):
+        torque, state = super().step(inputs, state)
+        TORQUES.append(torque)
+        return torque, state
+
+
+def noted_untrained():
+    agent = untrained()
+    return Noted(agent.inner, agent.ticks, 2)
+
+
+def noted_structured():
+    """Has subgoals in its memory, too."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        agent = playing(StructuredAgent(repeat=4, draws="pink").eval())
+    return Noted(agent.inner, agent.ticks, 2)
 
 
 def test_an_agent_is_played_filmed_and_recorded_in_the_place_of_the_modules(tmp_path, capfd):
