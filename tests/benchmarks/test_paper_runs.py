@@ -90,6 +90,30 @@ def test_an_agent_that_was_trained_anew_is_measured_anew(folder, monkeypatch, ca
     assert runs.main(["--only", "mine"]) == 0 and "no weights at" in capsys.readouterr().out
 
 
+def test_an_agent_that_loads_its_weights_by_itself_is_measured_anew_where_they_are_others(folder, monkeypatch):
+    monkeypatch.setattr(parts, "_POLL", 0.0)
+    weights, started = folder / "agent.safetensors", []
+    run = runs.Run("mine", "mine", 1, further=("--agent", "mine:trained"), trained=weights)
+
+    def start(part):
+        started.append(part.first)
+        write(run, 1, 1, {"agent": "mine:trained"})
+        part.file.parent.mkdir(parents=True, exist_ok=True)
+        run.file.replace(part.file)
+        return subprocess.Popen(["true"])
+
+    monkeypatch.setattr(parts.Part, "start", start)
+    assert run.missing_weights() == weights
+    for content in (b"first", b"second"):
+        weights.write_bytes(content)
+        started.clear()
+        assert not runs.is_current(run, 2)
+        for _ in range(2):
+            parts.evaluate(run, runs.Options(episodes=2, part=1))
+        assert started == [0, 1] and runs.is_current(run, 2), "once with these weights"
+        assert runs.load(run)[runs.TRAINED] == digest(weights)
+
+
 def test_the_learned_scout_is_measured_by_weights_that_do_not_ship(folder, monkeypatch, capsys):
     file = folder / "explorer.safetensors"
     (row,) = (run for run in runs.ALL if run.name == "look_around_learned")
