@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from tyro.conf import arg
 
-from bringup.command import import_from_here, recorded_seeds
+from bringup.command import forget_command_line, import_from_here, recorded_seeds
 from bringup.options import INTERFACE, SPEED, Count, EpisodeOptions, FilePath, FolderPath, PlayerOptions
 from mujoban_core.files import check_file, check_folder
 from mujoban_core.program import called, read_options, run_command
@@ -60,6 +60,7 @@ class Options:
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = read_options(Options, command_line, called(PROG))
+    forget_command_line(command_line)
     play, stack = options.play, options.modules.player(options.play.body)
     import_from_here()
     seeds = None
