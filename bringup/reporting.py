@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from rich.console import Console
 from rich.table import Table
@@ -20,19 +20,33 @@ from mujoban_core.signals import StopSignal
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import seed_range
 
+Route = Literal["in process", "cluster", "graph"]
+"""What carries steps between world and modules: one process's memory, that of several, or ROS messages."""
 
-def played(player: Player, episodes: Episodes, options: EpisodeOptions, *, realtime: float = 0.0) -> dict[str, Any]:
+
+def played(
+    player: Player,
+    episodes: Episodes,
+    options: EpisodeOptions,
+    *,
+    route: Route = "in process",
+    batch: int | None = None,
+    realtime: float = 0.0,
+) -> dict[str, Any]:
     """Return what a report says of the game, beside who played it.
 
     Args:
         player: The modules, or an agent.
         episodes: Which are played.
         options: World, body and time limit.
+        route: How they are played.
+        batch: Episodes at the same time in each process; None where one follows the other.
         realtime: Simulated seconds per second; 0 is lockstep.
 
     Returns:
         `difficulty` of generated levels, or `level_file` with its SHA-256; `seed` of the first episode; `time_limit` in
-        steps; `body`, `world`, `realtime`; and the settings of the player. What does not apply is None.
+        steps; `body`, `world`, `route`, `batch`, `realtime`; and the settings of the player. What does not apply is
+        None.
 
     Raises:
         OSError: If the level file cannot be read.
@@ -46,6 +60,8 @@ def played(player: Player, episodes: Episodes, options: EpisodeOptions, *, realt
         "time_limit": options.time_limit or get_body(options.body).time_limit,
         "body": options.body,
         "world": options.world,
+        "route": route,
+        "batch": batch,
         "realtime": realtime,
         **player.settings(),
     }
@@ -75,6 +91,8 @@ class Reporting:
         self.results: Sequence[EpisodeResult] = []
         self._path, self._weights, self._asked = path, weights, len(episodes)
         self._game = {"body": game["body"], "world": game["world"], "played": dict(game)}
+        # Apart from the game, which is the same in all parts of a longer run.
+        self._game["first_number"] = episodes.first_number
         # Of a level file seeds do not tell which levels are kept for tests.
         self._generated = not episodes.source.levels
         if self._generated:

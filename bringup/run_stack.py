@@ -89,7 +89,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
         view=options.view,
     )
     weights = stack.identities()
-    reporting = Reporting(options.json, weights, episodes, played(stack, episodes, play, realtime=options.realtime))
+    game = played(stack, episodes, play, route="graph", realtime=options.realtime)
+    reporting = Reporting(options.json, weights, episodes, game)
     with reporting, _shown(len(episodes), None if options.headless else weights) as show:
 
         def on_refresh(monitor: MonitorNode, results: Sequence[EpisodeResult]) -> None:
