@@ -14,6 +14,7 @@ from bringup.command import Player
 from bringup.options import EpisodeOptions
 from bringup.results import EpisodeResult, report, summary
 from mujoban_core.bodies import get_body
+from mujoban_core.commit import commit_of
 from mujoban_core.files import digest
 from mujoban_core.reports import keep_report
 from mujoban_core.signals import StopSignal
@@ -92,7 +93,7 @@ class Reporting:
         self._path, self._weights, self._asked = path, weights, len(episodes)
         self._game = {"body": game["body"], "world": game["world"], "played": dict(game)}
         # Apart from the game, which is the same in all parts of a longer run.
-        self._game["first_number"] = episodes.first_number
+        self._game |= {"first_number": episodes.first_number, "commit": commit_of(Path(__file__).resolve())}
         # Of a level file seeds do not tell which levels are kept for tests.
         self._generated = not episodes.source.levels
         if self._generated:

@@ -35,6 +35,14 @@ def test_every_use_of_the_test_levels_is_kept_in_the_report(tmp_path):
     assert [(use["played"]["difficulty"], use["played"]["time_limit"]) for use in uses] == [(1, 3), (1, 3)]
 
 
+def test_a_report_on_levels_for_validation_names_the_code_that_played(tmp_path, monkeypatch):
+    monkeypatch.setattr("bringup.reporting.commit_of", lambda file: f"commit of {Path(file).name}")
+    path = tmp_path / "report.json"
+    few = ["--difficulty", 1, "--episodes", 1, "--seed", 7_000_000, "--time-limit", 3, *ALL_ORACLES, "--json", path]
+    assert run(evaluate, *few) == 0
+    assert json.loads(path.read_text())["commit"] == "commit of reporting.py"
+
+
 def test_a_report_says_what_was_played(tmp_path):
     path, levels = tmp_path / "report.json", tmp_path / "levels.txt"
     write_levels(levels, [Level.from_text(UNSOLVABLE)])
