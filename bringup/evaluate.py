@@ -115,8 +115,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
     episodes.first_number = options.first_number
     stack = options.modules.player(play.body)
     set_threads(stack.threads)
-    route = "graph" if options.graph else "cluster" if options.shared.cluster else "in process"
-    game = played(stack, episodes, play, route=route, batch=None if options.graph else options.batch)
+    route, batch = ("graph", None) if options.graph else ("in process", options.batch)
+    game = played(stack, episodes, play, route=route, batch=batch)
     reporting = Reporting(options.json, stack.identities(), episodes, game)
     with reporting:
         results, extra = _play(options, stack, episodes, reporting)

@@ -21,8 +21,8 @@ from mujoban_core.signals import StopSignal
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import seed_range
 
-Route = Literal["in process", "cluster", "graph"]
-"""What carries steps between world and modules: one process's memory, that of several, or ROS messages."""
+Route = Literal["in process", "graph"]
+"""What carries steps between world and modules: the memory of a process, or ROS messages."""
 
 
 def played(
@@ -41,7 +41,7 @@ def played(
         episodes: Which are played.
         options: World, body and time limit.
         route: How they are played.
-        batch: Episodes at the same time in each process; None where one follows the other.
+        batch: Episodes at the same time in a process; None where one follows the other.
         realtime: Simulated seconds per second; 0 is lockstep.
 
     Returns:
