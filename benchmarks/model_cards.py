@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.paper import bodies, tables
-from benchmarks.paper.runs import ALL, ROOT, distinct, load
+from benchmarks.paper.runs import ALL, ROOT, distinct, is_stale, load
 from bringup import model_card
 from bringup.model_card import Place, Score
 from mujoban_core.files import write_atomically
@@ -45,7 +45,7 @@ def _scores(digest: str | None) -> list[Score]:
     return [
         Score(
             run.title, tables.privileged(run, report), len(report["episodes"]), report["success_rate"],
-            report["success_interval"],
+            report["success_interval"], is_stale(report, run),
         )
         for run in distinct((*bodies.RUNS, *ALL))
         if (report := load(run)) is not None and digest in report["weights"].values()

@@ -265,3 +265,15 @@ def oracle(role: str, body: str) -> Choice:
 def import_from_here(path: Sequence[str] = ("",)) -> None:
     """Let `package.module:Class` name modules of the working directory, as `python -m` does."""
     sys.path[:0] = [entry for entry in path if entry not in sys.path]
+
+
+def forget_command_line(command_line: Sequence[str] | None) -> None:
+    """Take the options out of what this process, and any that it starts, can read of its command line with `sys`.
+
+    They say which levels are played, which no plugin is to know (docs/security.md).
+
+    Args:
+        command_line: What the command has read; nothing is done unless that is the process's own, None.
+    """
+    if command_line is None and (options := len(sys.argv) - 1):
+        del sys.argv[-options:], sys.orig_argv[-options:]

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 from tyro.conf import arg
 
-from bringup.command import Player, import_from_here
+from bringup.command import Player, forget_command_line, import_from_here
 from bringup.options import HERE, ClusterOptions, Count, EpisodeOptions, FilePath, PlayerOptions
 from mujoban_core.bodies import BALL
 from mujoban_core.files import check_file
@@ -102,6 +102,7 @@ def evaluate(
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = read_options(Options, command_line, called(PROG), __doc__)
+    forget_command_line(command_line)
     check_file("--json", options.json)
     import_from_here()
     from bringup.reporting import Reporting, played
@@ -114,7 +115,9 @@ def main(command_line: Sequence[str] | None = None) -> int:
     episodes.first_number = options.first_number
     stack = options.modules.player(play.body)
     set_threads(stack.threads)
-    reporting = Reporting(options.json, stack.identities(), episodes, played(stack, episodes, play))
+    route, batch = ("graph", None) if options.graph else ("in process", options.batch)
+    game = played(stack, episodes, play, route=route, batch=batch)
+    reporting = Reporting(options.json, stack.identities(), episodes, game)
     with reporting:
         results, extra = _play(options, stack, episodes, reporting)
     reporting.finish(results, **extra)

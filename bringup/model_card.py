@@ -14,6 +14,11 @@ from mujoban_core.text import readable
 _WIDTH: Final = 112
 _SPENT: Final = ("steps", "updates", "samples", "env_steps", "seconds")
 """What a record counts up to the end of its run."""
+_ORIGINS: Final = ("init", "initial", "start", "teacher", "critic", "bags_digest")
+"""Digests, in a record, of what weights began with and learned from."""
+_STALE: Final = "†"
+_DIGITS: Final = 16
+"""Of a digest, enough to tell files apart."""
 _NAMED_TEACHERS: Final = ("scripted driver",)
 """What a record's `teacher` may be beside a digest."""
 
@@ -160,6 +165,8 @@ class Score(NamedTuple):
     success_rate: float
     interval: tuple[float, float]
     """Of 95 %."""
+    stale: bool = False
+    """Whether what played beside the weights had others than it has now."""
 
 
 class Place(NamedTuple):
@@ -226,7 +233,7 @@ def _weights(record: Mapping[str, Any], weights: str) -> list[tuple[str, str]]:
         ("file", f"`{weights}`"),
         ("class", f"`{record['class']}`"),
         ("parameters", f"{record['parameters']:,}"),
-        ("digest", f"`{record['digest'][:16]}`"),
+        ("digest", f"`{record['digest'][:_DIGITS]}`"),
         ("license", "Apache-2.0"),
     ]
 
@@ -239,9 +246,10 @@ def _training(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     if record.get("bags"):
         bags = record["bags"]
         rows.append(("bags", str(bags if isinstance(bags, int) else len(bags))))
+    rows += [(name, _told(record[name])) for name in _ORIGINS if record.get(name)]
     # The best of a run's evaluations is kept, and what it had taken by then is not noted.
     whole = " of the whole run" if record.get("validation") else ""
-    for name in ("method", "teacher", "steps", "updates", "samples", "env_steps", "seconds", "commit", "torch"):
+    for name in ("method", "steps", "updates", "samples", "env_steps", "seconds", "commit", "torch"):
         if record.get(name) is not None:
             value = record[name]
             of = whole if name in _SPENT else ""
@@ -251,6 +259,13 @@ def _training(record: Mapping[str, Any]) -> list[tuple[str, str]]:
         nothing = ": what it began with, as training made it no better" if begun and record["evaluation"] == 0 else ""
         rows.append(("kept", f"what the run had at its evaluation {record['evaluation']}, counted from 0{nothing}"))
     return rows
+
+
+def _told(origin: str | Mapping[str, str]) -> str:
+    """Return the digest of an origin, or those of several by name, as a cell."""
+    if isinstance(origin, str):
+        return f"`{origin if origin in _NAMED_TEACHERS else origin[:_DIGITS]}`"
+    return ", ".join(f"{name} {_told(digest)}" for name, digest in origin.items())
 
 
 def _command(record: Mapping[str, Any]) -> str:
@@ -267,6 +282,11 @@ def _scores(record: Mapping[str, Any], purpose: Purpose, place: Place, scores: S
     if scores:
         yield f"As part of the stack, on {place.levels}:"
         yield _table(("configuration", "oracles", "levels", "solved", "95 % interval"), [_cells(s) for s in scores])
+        if any(score.stale for score in scores):
+            yield (
+                f"{_STALE} Measured with these weights, but with others than ship now beside them; it may come to "
+                "something else today."
+            )
     kept = record.get("validation")
     numbers = _numbers(kept or record.get("metrics") or {})
     metrics = [(name, readable(value)) for name, value in numbers if name.startswith(purpose.own)]
@@ -283,7 +303,8 @@ def _scores(record: Mapping[str, Any], purpose: Purpose, place: Place, scores: S
 def _cells(score: Score) -> tuple[str, ...]:
     low, high = (100 * bound for bound in score.interval)
     solved = f"{100 * score.success_rate:.1f} %"
-    return score.configuration, score.oracles, str(score.levels), solved, f"{low:.1f} to {high:.1f} %"
+    configuration = f"{score.configuration} {_STALE}" if score.stale else score.configuration
+    return configuration, score.oracles, str(score.levels), solved, f"{low:.1f} to {high:.1f} %"
 
 
 def _settings(record: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -1,7 +1,8 @@
-"""What is drawn over a video: the instruction in force, p(beta), and the estimate as a small map."""
+"""What is drawn over a video: the instruction in force, p(beta), the estimate as a small map, who is told the truth."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -17,6 +18,9 @@ BAR: Final = 32
 MARGIN: Final = 8
 """Pixels from the corner of the picture to the map."""
 _FONT_SIZE: Final = 18
+_SMALL: Final = 14
+_YELLOW: Final = (240, 220, 60)
+"""As the same line is on a terminal (`bringup.view`)."""
 _BACKGROUND: Final = 30.0
 COLOURS: Final = {
     "wall": (150, 140, 140),
@@ -86,6 +90,20 @@ def draw(picture: NDArray[np.uint8], said: Said, step: int) -> NDArray[np.uint8]
     name = Instruction(said.instruction).name.lower()
     text = f"{name}, number {said.sequence}    p(beta) {said.probability:.2f}    {step * CONTROL_PERIOD:.1f} s"
     brush.text((BAR + 4, top + BAR / 2), text, fill="white", anchor="lm", font=ImageFont.load_default(_FONT_SIZE))
+    return np.asarray(image)
+
+
+def name_told(picture: NDArray[np.uint8], told: Sequence[str]) -> NDArray[np.uint8]:
+    """Return the picture, [H, W, 3], with a line at the bottom that names who is told the ground truth, if anybody."""
+    if not told:
+        return picture
+    image = Image.fromarray(picture)
+    brush = ImageDraw.Draw(image)
+    top = image.height - BAR
+    brush.rectangle((0, top, image.width, image.height), fill=(0, 0, 0))
+    text = f"privileged, told the ground truth:\n{', '.join(told)}"
+    font = ImageFont.load_default(_SMALL)
+    brush.text((4, top + BAR / 2), text, fill=_YELLOW, anchor="lm", font=font, spacing=1)
     return np.asarray(image)
 
 

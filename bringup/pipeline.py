@@ -1,14 +1,16 @@
 """Run stages, each a command of its own, in the order in which they need each other; stop and go on at any point.
 
-What is done stands in `pipeline.json` of the run's directory: for every stage its command, the digests of what it
-came from and of what it made, and the time that it took, by the clock and of the processor. A stage that was stopped is
-started again with the same command: every trainer of this project resumes from its directory. So is one whose products
-are gone where another needs them.
+What is done stands in `pipeline.json` of the run's directory: for every stage its command, the code and the machine
+that it ran with, the digests of what it came from and of what it made, and the time that it took, by the clock and of
+the processor. A stage that was stopped is started again with the same command: every trainer of this project resumes
+from its directory. So is one whose products are gone where another needs them; products that are others than were made
+are refused there.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import resource
 import shutil
 import subprocess
@@ -17,10 +19,12 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from mujoban_core import children
+from mujoban_core.commit import commit_of
 from mujoban_core.files import alone, digest, write_atomically
 from mujoban_core.signals import StopSignal
 
@@ -30,6 +34,8 @@ _GRACE = 90.0
 """Seconds that a command has, after SIGTERM, to write its checkpoint."""
 _TAIL = 2000
 """Characters of a failed command's log that the error shows."""
+_LATE = 0.1
+"""Of the time that a stage has taken so far, what is expected of it at least until it ends."""
 
 
 class PipelineError(ValueError):
@@ -71,6 +77,9 @@ class Entry:
     inputs: dict[str, str] = field(default_factory=dict)
     """SHA-256 digests of the products of the stages that it needed, and of its sources."""
     outputs: dict[str, str] = field(default_factory=dict)
+    ran_with: list[dict[str, Any]] = field(default_factory=list)
+    """Code and machine: `commit`, `torch`, `cores` that the stage was given of the `machine_cores`; a further entry
+    where a start had others than the one before."""
 
 
 class Pipeline:
@@ -142,9 +151,14 @@ class Pipeline:
         return total
 
     def remaining(self) -> float:
-        """Return the seconds until all is done, if every stage takes as long as is expected of it."""
+        """Return the seconds until all is done, if every stage takes as long as is expected of it.
+
+        One that has taken longer, as budgets of the processor do on a busy machine, is expected to take on for a part
+        of what it has taken: the end that is told has never passed.
+        """
         done = {name for name, entry in self.entries.items() if entry.done}
-        left = {s.name: max(0.0, s.seconds - self.elapsed(s.name)) for s in self.stages if s.name not in done}
+        taken = {s.name: self.elapsed(s.name) for s in self.stages if s.name not in done}
+        left = {s.name: max(s.seconds - taken[s.name], _LATE * taken[s.name]) for s in self.stages if s.name in taken}
         running, total = self.running(), 0.0
         while left:
             running += [s.name for s in self._ready(self.entries.keys() - left, running)]
@@ -163,11 +177,12 @@ class Pipeline:
 
         Raises:
             PipelineError: If a command fails or does not make what it should; the others are stopped. Or if another
-                process runs the stages of this directory.
+                process runs the stages of this directory, or what a stage needs was changed since it was made.
             Interrupted: If a signal came; the commands were stopped and have kept their checkpoints.
         """
         with self.alone(), StopSignal() as stop:
             self._redo_what_is_gone()
+            self._check_what_is_needed()
             try:
                 while not self.done:
                     stop.check()
@@ -199,6 +214,21 @@ class Pipeline:
             if not entry.done:
                 wanted.update(stage.needs)
 
+    def _check_what_is_needed(self) -> None:
+        """Check that products which stages are yet to take are those that were made; what nobody takes may change."""
+        wanted = {need for stage in self.stages if not self.entries[stage.name].done for need in stage.needs}
+        for stage in self.stages:
+            made = self.entries[stage.name]
+            if stage.name not in wanted or not made.done:
+                continue
+            for path in stage.products:
+                expected = made.outputs.get(_name(path, self.directory))
+                if expected is not None and (found := digest(path)) != expected:
+                    raise PipelineError(
+                        f"{path}: was changed since stage {stage.name} made it: SHA-256 is {found[:16]}, expected "
+                        f"{expected[:16]}; or remove it, and it is made again"
+                    )
+
     def _start_ready(self) -> None:
         done = {name for name, entry in self.entries.items() if entry.done}
         for stage in self._ready(done, self.running()):
@@ -222,6 +252,8 @@ class Pipeline:
         entry.command = list(stage.command)
         entry.inputs = {k: v for need in stage.needs for k, v in self.entries[need].outputs.items()}
         entry.inputs |= {_name(p, self.directory): digest(p) for p in stage.sources}
+        if (now := _ran_with(stage)) not in entry.ran_with[-1:]:
+            entry.ran_with.append(now)
         self._save()
         if not stage.resumes:
             _remove(stage.products)
@@ -277,6 +309,14 @@ class Pipeline:
         self.directory.mkdir(parents=True, exist_ok=True)
         content: Mapping[str, Any] = {name: asdict(entry) for name, entry in self.entries.items() if entry.command}
         write_atomically(self._file, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def _ran_with(stage: Stage) -> dict[str, Any]:
+    """Return what `Entry.ran_with` keeps of a start."""
+    return {
+        "commit": commit_of(Path(__file__).resolve()), "torch": version("torch"), "cores": stage.cores,
+        "machine_cores": len(os.sched_getaffinity(0)),
+    }  # fmt: skip
 
 
 def _spent_by_children() -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from rich.console import Console
 from rich.table import Table
@@ -14,25 +14,40 @@ from bringup.command import Player
 from bringup.options import EpisodeOptions
 from bringup.results import EpisodeResult, report, summary
 from mujoban_core.bodies import get_body
+from mujoban_core.commit import commit_of
 from mujoban_core.files import digest
 from mujoban_core.reports import keep_report
 from mujoban_core.signals import StopSignal
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import seed_range
 
+Route = Literal["in process", "graph"]
+"""What carries steps between world and modules: the memory of a process, or ROS messages."""
 
-def played(player: Player, episodes: Episodes, options: EpisodeOptions, *, realtime: float = 0.0) -> dict[str, Any]:
+
+def played(
+    player: Player,
+    episodes: Episodes,
+    options: EpisodeOptions,
+    *,
+    route: Route = "in process",
+    batch: int | None = None,
+    realtime: float = 0.0,
+) -> dict[str, Any]:
     """Return what a report says of the game, beside who played it.
 
     Args:
         player: The modules, or an agent.
         episodes: Which are played.
         options: World, body and time limit.
+        route: How they are played.
+        batch: Episodes at the same time in a process; None where one follows the other.
         realtime: Simulated seconds per second; 0 is lockstep.
 
     Returns:
         `difficulty` of generated levels, or `level_file` with its SHA-256; `seed` of the first episode; `time_limit` in
-        steps; `body`, `world`, `realtime`; and the settings of the player. What does not apply is None.
+        steps; `body`, `world`, `route`, `batch`, `realtime`; and the settings of the player. What does not apply is
+        None.
 
     Raises:
         OSError: If the level file cannot be read.
@@ -46,6 +61,8 @@ def played(player: Player, episodes: Episodes, options: EpisodeOptions, *, realt
         "time_limit": options.time_limit or get_body(options.body).time_limit,
         "body": options.body,
         "world": options.world,
+        "route": route,
+        "batch": batch,
         "realtime": realtime,
         **player.settings(),
     }
@@ -75,6 +92,8 @@ class Reporting:
         self.results: Sequence[EpisodeResult] = []
         self._path, self._weights, self._asked = path, weights, len(episodes)
         self._game = {"body": game["body"], "world": game["world"], "played": dict(game)}
+        # Apart from the game, which is the same in all parts of a longer run.
+        self._game |= {"first_number": episodes.first_number, "commit": commit_of(Path(__file__).resolve())}
         # Of a level file seeds do not tell which levels are kept for tests.
         self._generated = not episodes.source.levels
         if self._generated:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from tyro.conf import arg
 
-from bringup.command import import_from_here, recorded_seeds
+from bringup.command import forget_command_line, import_from_here, recorded_seeds
 from bringup.options import INTERFACE, SPEED, Count, EpisodeOptions, FilePath, FolderPath, PlayerOptions
 from mujoban_core.files import check_file, check_folder
 from mujoban_core.program import called, read_options, run_command
@@ -60,6 +60,7 @@ class Options:
 def main(command_line: Sequence[str] | None = None) -> int:
     """Run the command."""
     options = read_options(Options, command_line, called(PROG))
+    forget_command_line(command_line)
     play, stack = options.play, options.modules.player(options.play.body)
     import_from_here()
     seeds = None
@@ -88,7 +89,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
         view=options.view,
     )
     weights = stack.identities()
-    reporting = Reporting(options.json, weights, episodes, played(stack, episodes, play, realtime=options.realtime))
+    game = played(stack, episodes, play, route="graph", realtime=options.realtime)
+    reporting = Reporting(options.json, weights, episodes, game)
     with reporting, _shown(len(episodes), None if options.headless else weights) as show:
 
         def on_refresh(monitor: MonitorNode, results: Sequence[EpisodeResult]) -> None:

@@ -26,6 +26,7 @@ from bringup.video import EDGE, VideoNode
 from mujoban_core import children
 from mujoban_core.bodies import get_body
 from mujoban_core.camera import FRAME_SIZE
+from mujoban_core.plugins import privileged_roles
 from mujoban_core.signals import StopSignal
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.run_identifier import ANY, draw_run
@@ -140,7 +141,13 @@ def play(
             recorder = _recorder(options.record, options, stack.body, episodes.max_boxes, instructed=not alone)
             listeners.append(graph.add(recorder))
         if options.video is not None:
-            video = VideoNode(options.video, alone=alone, run=options.run, intra_process=graph.intra_process)
+            video = VideoNode(
+                options.video,
+                alone=alone,
+                told=privileged_roles(stack.identities()),
+                run=options.run,
+                intra_process=graph.intra_process,
+            )
             listeners.append(graph.add(video))
         if options.view is not None:
             exits.enter_context(viewer(options.view, options.run))

@@ -16,7 +16,8 @@ from matplotlib import pyplot as plt
 
 from bringup import keep
 from bringup.model_card import Place, Score, card
-from bringup.pipeline import Entry, Pipeline
+from bringup.pipeline import Entry, Pipeline, Stage
+from bringup.stage_sections import sections
 from mujoban_core.files import write_atomically
 from mujoban_core.text import readable
 from mujoban_planner.deliberation import LOOK_AHEAD
@@ -66,10 +67,12 @@ def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> P
             shutil.copyfile(source, target)
         text = card(target, f"weights/{role}.safetensors", _PLACE, scores)
         write_atomically(target.with_suffix(".md"), text.encode())
-    figure = draw_curves(run, [s.name for s in pipeline.stages], run / "curves.png")
+    titles = {stage.name: _title(stage.name, pipeline) for stage in pipeline.stages}
+    figure = draw_curves(run, titles, run / "curves.png")
     lines = [*_summary(run, evaluations, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
     if figure:
         lines += ["", "![Validation scores against CPU seconds](curves.png)"]
+    lines += ["", "## Metrics and curves of each stage", *sections(run, titles)]
     path = run / "report.md"
     write_atomically(path, ("\n".join(lines) + "\n").encode())
     return path
@@ -85,9 +88,15 @@ def read_curves(run: Path) -> dict[str, list[tuple[float, float]]]:
     return curves
 
 
-def draw_curves(run: Path, names: list[str], path: Path) -> bool:
-    """Draw the validation curves of all trainings, one panel each; return whether there are any."""
-    found = {name: curves for name in names if (curves := _rates(run / name))}
+def draw_curves(run: Path, titles: Mapping[str, str], path: Path) -> bool:
+    """Draw the validation curves of all trainings, one panel each; return whether there are any.
+
+    Args:
+        run: Directory of the run.
+        titles: Of the panels, by the names of the stages.
+        path: The picture.
+    """
+    found = {title: curves for name, title in titles.items() if (curves := _rates(run / name))}
     if not found:
         return False
     columns = min(len(found), _COLUMNS)
@@ -95,10 +104,10 @@ def draw_curves(run: Path, names: list[str], path: Path) -> bool:
     figure, axes = plt.subplots(rows, columns, figsize=(3.6 * columns, 3.0 * rows), squeeze=False)
     for axis in axes.flat[len(found) :]:
         axis.remove()
-    for axis, (name, curves) in zip(axes.flat, found.items(), strict=False):
+    for axis, (title, curves) in zip(axes.flat, found.items(), strict=False):
         for label, points in curves.items():
             axis.plot(*zip(*points, strict=True), label=label.replace("_", " ").replace("/", ", "), marker=".")
-        axis.set(title=name.replace("_", " "), xlabel="CPU seconds of all processes", ylim=(0.0, 1.02))
+        axis.set(title=title, xlabel="CPU seconds of all processes", ylim=(0.0, 1.02))
         axis.legend(fontsize=8)
     for row in axes:
         row[0].set_ylabel("rate on validation levels")
@@ -145,6 +154,11 @@ def _is_kept(entry: Entry) -> bool:
     return entry.command[1:2] == [keep.PROG]
 
 
+def _title(name: str, pipeline: Pipeline) -> str:
+    """Return how a stage is headed; curves of one that was kept are of the run that made it."""
+    return name.replace("_", " ") + (" (kept)" if _is_kept(pipeline.entries[name]) else "")
+
+
 def _score(name: str, report: Mapping[str, Any]) -> Score:
     levels = len(report["episodes"])
     return Score(EVALUATIONS[name].title, "none", levels, report["success_rate"], report["success_interval"])
@@ -178,18 +192,31 @@ def _summary(run: Path, evaluations: Mapping[str, Mapping[str, Any]], pipeline: 
 
 def _stages(run: Path, pipeline: Pipeline) -> Iterator[str]:
     yield ""
-    yield "| stage | minutes | CPU minutes | samples | updates | last validation |"
+    yield "| stage | minutes | CPU minutes | samples | updates | last validation, or what came of it |"
     yield "|---|---|---|---|---|---|"
     for stage in pipeline.stages:
         record = _record(stage.products)
         metrics = record.get("metrics", {})
         scores = ", ".join(f"{k} {readable(v)}" for k, v in metrics.items() if k.startswith((*_RATES, "steps")))
+        scores = scores or _outcome(run, stage)
         done = (readable(record[kind]) if kind in record else "" for kind in ("samples", "updates"))
         entry = pipeline.entries[stage.name]
         minutes = (readable(seconds / 60) for seconds in (entry.seconds, entry.cpu_seconds))
         name = f"{stage.name} (kept: what it once took is not counted)" if _is_kept(entry) else stage.name
         cells = (name, *minutes, *done, scores)
         yield f"| {' | '.join(cells)} |"
+
+
+def _outcome(run: Path, stage: Stage) -> str:
+    """Return what a recording or an evaluation came to; nothing of other stages."""
+    log = run / "logs" / f"{stage.name}.txt"
+    if stage.name.startswith("bags_") and log.exists():
+        return next((line for line in reversed(log.read_text().splitlines()) if _RECORDED.match(line)), "")
+    file = run / f"{stage.name}.json"
+    if stage.name not in EVALUATIONS or not file.exists():
+        return ""
+    report = json.loads(file.read_text())
+    return f"{report['success_rate']:.1%} of {len(report['episodes'])} levels solved"
 
 
 def _record(products: tuple[Path, ...]) -> dict[str, Any]:
@@ -209,6 +236,9 @@ def _origins(pipeline: Pipeline) -> Iterator[str]:
         entry = pipeline.entries[stage.name]
         yield ""
         yield f"- **{stage.name}**: `python {' '.join(entry.command)}`"
+        for told in entry.ran_with:
+            cores = f"{told['cores']} of {told['machine_cores']} cores"
+            yield f"  - by commit {told['commit'] or 'unknown'}, torch {told['torch']}, {cores}"
         for direction, digests in (("from", entry.inputs), ("made", entry.outputs)):
             for name, digest in digests.items():
                 yield f"  - {direction} `{name}`, SHA-256 {digest[:16]}"

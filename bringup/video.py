@@ -6,7 +6,7 @@ import errno
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Unpack
@@ -15,7 +15,7 @@ import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
-from bringup.overlay import Said, draw
+from bringup.overlay import Said, draw, name_told
 from mujoban_core.grid import CONTROL_PERIOD
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import Received, listen
@@ -59,12 +59,21 @@ class VideoNode(GraphNode):
         written: Stamp of the latest picture [ns].
     """
 
-    def __init__(self, path: Path, *, alone: bool = False, run: int = ANY, **options: Unpack[NodeOptions]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        alone: bool = False,
+        told: Sequence[str] = (),
+        run: int = ANY,
+        **options: Unpack[NodeOptions],
+    ) -> None:
         """Open the file.
 
         Args:
             path: Of the video.
             alone: Whether an agent plays alone, and there are no modules whose word could be waited for.
+            told: Roles that are told the ground truth, which every picture says.
             run: Identifier of the run that is filmed, if it is known.
             **options: Of the node.
 
@@ -88,6 +97,7 @@ class VideoNode(GraphNode):
         self._waiting: dict[int, _Picture] = {}
         self._said: dict[int, Said] = {}
         self._latest: Said | None = None
+        self._told = tuple(told)
         self._patience = 0 if alone else PATIENCE
         said = [] if alone else [(self._on_said, _SAID)]
         for handle, parts in ((self._on_seen, _SEEN), *said):
@@ -138,9 +148,10 @@ class VideoNode(GraphNode):
             del self._waiting[stamp]
             self._latest = self._said.get(stamp, self._latest)
             self._said = {later: said for later, said in self._said.items() if later > stamp}
-            pixels = picture.pixels
+            seen, above = picture.pixels[:, :EDGE], name_told(picture.pixels[:, EDGE:], self._told)
             if self._latest is not None:
-                pixels = np.concatenate([draw(pixels[:, :EDGE], self._latest, picture.step), pixels[:, EDGE:]], axis=1)
+                seen = draw(seen, self._latest, picture.step)
+            pixels = np.concatenate([seen, above], axis=1)
             try:
                 self._writer.append_data(pixels)
             except OSError as error:

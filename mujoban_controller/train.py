@@ -21,6 +21,7 @@ if __name__ == "__main__":
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -162,14 +163,17 @@ class _Parts:
         torch.manual_seed(config.seed)
         # With nothing before, the streams of the seed alone: NumPy takes a missing number for 0.
         self._streams = iter(np.random.SeedSequence([config.seed, began]).spawn(8))
-        rng = np.random.default_rng(next(self._streams))
-        episodes = TrainingEpisodes(config.task.difficulty, rng, max_nodes=PLANNER_NODES)
-        self.task = GoalTask(
-            config.task, OraclePlanner(max_nodes=PLANNER_NODES), episodes, rng, threads=options.threads
-        )
+        self._rng = np.random.default_rng(next(self._streams))
         self.validation = Validation(
             options.evaluation_episodes, config.task.body, config.task.difficulty, config.task.world, options.threads
         )
+
+    @cached_property
+    def task(self) -> GoalTask:
+        """What is played, in a world of its own; a run that learns from bags alone never makes it."""
+        task, rng = self.config.task, self._rng
+        episodes = TrainingEpisodes(task.difficulty, rng, max_nodes=PLANNER_NODES)
+        return GoalTask(task, OraclePlanner(max_nodes=PLANNER_NODES), episodes, rng, threads=self.options.threads)
 
     def generator(self) -> torch.Generator:
         return torch.Generator().manual_seed(int(next(self._streams).generate_state(1, np.uint64)[0] >> 1))

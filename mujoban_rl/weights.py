@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from safetensors.torch import save as dump_tensors
 from torch import Tensor, nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
+from mujoban_core.commit import commit_of
 from mujoban_core.files import digest, write_atomically
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
@@ -48,21 +48,7 @@ def provenance() -> dict[str, Any]:
     spec = getattr(main, "__spec__", None)
     if spec is not None and spec.name:
         command = ["python", "-m", spec.name.removesuffix(".__main__"), *sys.argv[1:]]
-    return {"command": " ".join(command), "commit": _commit(), "torch": torch.__version__}
-
-
-def _commit() -> str | None:
-    """Return the commit of this code; None where it is in no repository, or lies in one of something else."""
-    file = Path(__file__)
-    found = ""
-    for command in (["ls-files", "--error-unmatch", file.name], ["rev-parse", "--verify", "HEAD"]):
-        try:
-            found = subprocess.run(
-                ["git", *command], cwd=file.parent, capture_output=True, text=True, timeout=10, check=True
-            ).stdout.strip()
-        except (OSError, subprocess.SubprocessError):
-            return None
-    return found
+    return {"command": " ".join(command), "commit": commit_of(Path(__file__)), "torch": torch.__version__}
 
 
 def origin(path: str | Path | None) -> str | None:

@@ -47,6 +47,28 @@ def test_a_card_has_the_metrics_of_its_own_module_and_says_what_is_of_the_whole_
     assert "| samples |" in cards["planner"]
 
 
+def test_scores_of_another_stack_are_marked(monkeypatch):
+    (path,) = (path for path in model_cards.records() if path.stem == "controller_ball")
+    mark, note = "| default † | none |", "† Measured with these weights, but with others than ship now beside them"
+    monkeypatch.setattr(model_cards, "is_stale", lambda report, run: run.name == "default")
+    told = model_cards.card(path)
+    assert mark in told and "| difficulty 1 | none |" in told and note in told
+    monkeypatch.setattr(model_cards, "is_stale", lambda report, run: False)
+    assert "†" not in model_cards.card(path)
+
+
+def test_a_card_names_what_the_weights_began_with_and_learned_from():
+    cards = {path.stem: (json.loads(path.read_text()), model_cards.card(path)) for path in model_cards.records()}
+    for stem, name in (
+        ("planner", "init"), ("controller_ball", "critic"), ("controller_ant", "teacher"), ("estimator", "bags_digest"),
+    ):  # fmt: skip
+        record, told = cards[stem]
+        assert f"| {name} | `{record[name][:16]}` |" in told
+    record, told = cards["estimator"]
+    start = [f"{role} `{record['start'][role][:16]}`" for role in ("estimator", "termination")]
+    assert f"| start | {', '.join(start)} |" in told
+
+
 def test_a_record_that_notes_which_evaluation_was_kept_has_it_on_its_card(tmp_path):
     (path,) = (path for path in model_cards.records() if path.stem == "teacher_ball")
     record = json.loads(path.read_text()) | {"evaluation": 2}

@@ -1,10 +1,11 @@
 """Plugins that try to cheat: one for each role, a scout and an agent, which collect what they can reach of the truth.
 
 They ask too late, or otherwise than they said, look at every field that they are given and at what lies behind it, keep
-it, and write into it. What docs/security.md leaves to the user is not tried: the interpreter's memory (`gc`, frames),
-other processes and files, a node of one's own, and levels made from guessed seeds.
+it, write into it, and read the command line. What docs/security.md leaves to the user is not tried: the interpreter's
+memory (`gc`, frames), other processes and files, a node of one's own, and levels made from guessed seeds.
 """
 
+import subprocess
 import sys
 import textwrap
 from functools import partial
@@ -16,6 +17,7 @@ import pytest
 import yaml
 from rich.console import Console
 
+from bringup import run_stack
 from bringup.command import Choice, Solo, Stack
 from bringup.evaluate import evaluate
 from bringup.graph import Processes
@@ -35,8 +37,10 @@ from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
 
 CHEATERS = """
+import sys
 import numpy as np
 from mujoban_core import agent, interfaces, look_around
+from mujoban_sokoban.generator import generate_level
 
 FOUND = {"seeds": [], "truth": [], "fields": set(), "behind": [], "kept": [], "scouted": []}
 
@@ -88,6 +92,18 @@ class Controller(Cheat, interfaces.Controller):
     def step(self, inputs, state):
         self.look(inputs)
         return np.zeros((len(inputs.instruction), 2), np.float32), state
+
+class Peek(Planner):
+    # Makes the levels from the command line and from the numbers of the episodes, which random streams are drawn from.
+    def initial_state(self, seeds):
+        told, levels = [*sys.argv, *sys.orig_argv], []
+        streams = interfaces.module_seeds(0, np.arange(1, 9)).tolist()
+        if "--seed" in told and "--difficulty" in told:
+            first, difficulty = (int(told[told.index(name) + 1]) for name in ("--seed", "--difficulty"))
+            levels = [generate_level(difficulty, first + streams.index(seed)).to_text() for seed in seeds.tolist()]
+        with open("peeked.txt", "a") as file:
+            print("peeked", *levels, sep="\\n", file=file)
+        return super().initial_state(seeds)
 
 class Confessing(Planner):
     privileged = True
@@ -218,6 +234,27 @@ def test_the_process_of_a_module_is_not_told_what_the_simulators_is(ros, cheater
             (told,) = yaml.safe_load(path.read_text()).items()
             assert told[0] == role and not {"seed", "difficulty", "level_file"} & told[1]["ros__parameters"].keys()
             assert not [file for file in path.parent.iterdir() if "simulator" in file.name]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("evaluate.py",), ("run_stack.py", "--headless"), ("run_stack.py", "--headless", "--processes")],
+    ids=["rollout", "graph", "processes"],
+)
+def test_a_plugin_does_not_learn_of_the_level_from_the_command_line(cheaters, tmp_path, monkeypatch, command):
+    level = Episodes(1, 5_000_123, difficulty=1)[0].level.to_text()
+    options = ["--episodes", "1", "--seed", "5000123", "--difficulty", "1", "--time-limit", "6"]
+    peeked, (program, *others) = tmp_path / "peeked.txt", command
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as context:
+        context.setattr(sys, "argv", [program, *options])
+        cheaters.Peek().initial_state(module_seeds(0, np.array([1])))
+    assert level in peeked.read_text(), "what it would find"
+    peeked.unlink()
+    found = Path(run_stack.__file__).with_name(program)
+    players = ["--planner", "cheaters:Peek", "--oracle", "estimator,termination,controller"]
+    subprocess.run([sys.executable, found, *options, *players, *others], check=True, capture_output=True, timeout=120)
+    assert set(peeked.read_text().splitlines()) == {"peeked"}
 
 
 def test_an_instance_that_asks_otherwise_than_the_one_that_reports_name_does_not_play(cheaters, play_graph):

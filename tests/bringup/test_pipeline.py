@@ -5,7 +5,9 @@ import threading
 import time
 
 import pytest
+import torch
 
+from bringup import pipeline
 from bringup.pipeline import Pipeline, PipelineError, Stage
 from mujoban_core.files import InUseError, digest
 from mujoban_core.signals import Interrupted
@@ -89,6 +91,13 @@ def test_the_expected_end_follows_from_what_runs_beside_what(tmp_path):
     done.entries["c"].seconds = 4.0
     # One second of c is left, beside e, behind which d must wait.
     assert done.remaining() == 5
+
+
+def test_the_expected_end_of_a_stage_that_takes_longer_has_never_passed(tmp_path):
+    late = Pipeline(tmp_path, [Stage("a", (), (), seconds=10.0), Stage("b", (), (), ("a",), seconds=5.0)])
+    for taken in (10.0, 40.0):
+        late.entries["a"].seconds = taken
+        assert late.remaining() == pytest.approx(5.0 + taken / 10)
 
 
 def test_a_stopped_run_ends_its_commands_and_goes_on_where_it_was(tmp_path):
@@ -194,6 +203,33 @@ def test_two_runs_of_one_directory_are_refused(tmp_path):
 def test_a_need_that_is_no_earlier_stage_is_refused(tmp_path):
     with pytest.raises(PipelineError, match="stage second needs first"):
         Pipeline(tmp_path, stages(tmp_path)[1:])
+
+
+def test_what_a_stage_is_yet_to_take_must_be_what_was_made(tmp_path):
+    a, b = tmp_path / "a.txt", tmp_path / "b.txt"
+    Pipeline(tmp_path, stages(tmp_path)[:1]).run()
+    a.write_text("changed")
+    refused = r"a\.txt: was changed since stage first made it: SHA-256 is \w{16}, expected \w{16}; or remove it, and it"
+    with pytest.raises(PipelineError, match=refused):
+        Pipeline(tmp_path, stages(tmp_path)).run()
+    assert not b.exists()
+    a.unlink()
+    Pipeline(tmp_path, stages(tmp_path)).run()
+    assert b.read_text() == "ab"
+
+
+def test_the_record_names_the_code_and_the_machine_of_each_stage(tmp_path, monkeypatch):
+    commits = iter(["one", "one", "two-dirty"])
+    monkeypatch.setattr(pipeline, "commit_of", lambda file: next(commits))
+    product = tmp_path / "x"
+    for _ in range(2):
+        with pytest.raises(PipelineError):
+            Pipeline(tmp_path, [Stage("train", ("-c", "import sys; sys.exit(1)"), (product,), cores=2)]).run()
+    Pipeline(tmp_path, [Stage("train", write(product, "a"), (product,), cores=2)]).run()
+    starts = json.loads((tmp_path / "pipeline.json").read_text())["train"]["ran_with"]
+    assert [start["commit"] for start in starts] == ["one", "two-dirty"]
+    assert all(start["torch"] == torch.__version__ and start["cores"] == 2 for start in starts)
+    assert all(start["machine_cores"] == len(os.sched_getaffinity(0)) for start in starts)
 
 
 def test_what_is_gone_is_made_again_where_a_stage_needs_it_and_only_there(tmp_path):

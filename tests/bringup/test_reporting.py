@@ -35,17 +35,33 @@ def test_every_use_of_the_test_levels_is_kept_in_the_report(tmp_path):
     assert [(use["played"]["difficulty"], use["played"]["time_limit"]) for use in uses] == [(1, 3), (1, 3)]
 
 
+def test_a_report_on_levels_for_validation_names_the_code_that_played(tmp_path, monkeypatch):
+    monkeypatch.setattr("bringup.reporting.commit_of", lambda file: f"commit of {Path(file).name}")
+    path = tmp_path / "report.json"
+    few = ["--difficulty", 1, "--episodes", 1, "--seed", 7_000_000, "--time-limit", 3, *ALL_ORACLES, "--json", path]
+    assert run(evaluate, *few) == 0
+    assert json.loads(path.read_text())["commit"] == "commit of reporting.py"
+
+
 def test_a_report_says_what_was_played(tmp_path):
     path, levels = tmp_path / "report.json", tmp_path / "levels.txt"
     write_levels(levels, [Level.from_text(UNSOLVABLE)])
     game = {
         "difficulty": 1, "level_file": None, "level_file_sha256": None, "seed": 5_000_007, "time_limit": 3,
         "body": "ball", "world": "reference", "realtime": 0.0, "look_around": 7, "look_ahead": 0, "thinking": 0,
+        "route": "in process", "batch": 3,
     }  # fmt: skip
     few = ["--episodes", 1, "--seed", 5_000_007, "--world", "reference", *ALL_ORACLES, "--json", path]
-    assert run(evaluate, *few, "--difficulty", 1, "--time-limit", 3, "--look-around", 7) == 0
+    third = ["--first-number", 3]
+    assert run(evaluate, *few, "--difficulty", 1, "--time-limit", 3, "--look-around", 7, "--batch", 3, *third) == 0
     assert json.loads(path.read_text())["played"] == game
+    assert json.loads(path.read_text())["first_number"] == 3
+    through = ["--difficulty", 1, "--time-limit", 3, "--look-around", 7, "--graph"]
+    assert run(evaluate, *few, *through) == 0
+    assert json.loads(path.read_text())["played"] == {**game, "route": "graph", "batch": None}
+    assert json.loads(path.read_text())["first_number"] == 1
     filed = {"difficulty": None, "level_file": str(levels), "level_file_sha256": digest(levels)}
+    filed |= {"route": "graph", "batch": None}
     assert run(run_stack, "--headless", *few, "--levels", levels, "--time-limit", 3, "--realtime", 9) == 0
     assert json.loads(path.read_text())["played"] == {**game, **filed, "look_around": 0, "realtime": 9.0}
     searching = Stack(deliberation=Deliberation(look_ahead=400, certainty=0.8), body="ant")

@@ -12,8 +12,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from visualization_msgs.msg import Marker, MarkerArray
 
 from bringup.command import Choice, Solo, Stack
-from bringup.overlay import BAR, CELL, COLOURS, MARGIN, grid_picture
-from bringup.stack import top_camera_size
+from bringup.overlay import BAR, CELL, COLOURS, MARGIN, grid_picture, name_told
+from bringup.stack import PlayOptions, play, top_camera_size
 from bringup.video import EDGE, VideoNode
 from bringup.viz import VizNode, occupancy_grid
 from mujoban_core.bodies import get_body
@@ -142,6 +142,20 @@ def test_a_video_shows_both_views_and_what_the_modules_say(play_graph, tmp_path)
     line = frames[0][-BAR:, :EDGE]
     assert (line > 200).any() and (line < 40).any(), "the instruction is written at the bottom"
     assert not (frames[0][-BAR:, EDGE:] == frames[0][-BAR:, :EDGE]).all()
+
+
+def test_a_video_names_who_is_told_the_truth_and_nobody_where_nobody_is(tmp_path):
+    last = {}
+    oracles = Stack({role: Choice(role, "oracle") for role in ROLES})
+    learned = Stack({role: Choice(role) for role in ROLES})
+    for name, player in (("told", oracles), ("learned", learned)):
+        file = tmp_path / f"{name}.mp4"
+        play(player, Episodes(1, 0, difficulty=1), PlayOptions(time_limit=4, video=file))
+        (*_, last[name]) = (np.asarray(frame)[-BAR:, EDGE:].astype(int) for frame in imageio.get_reader(file))
+    yellow = [((line[..., :2] > 160) & (line[..., 2:] < 120)).all(-1).sum() for line in last.values()]
+    assert yellow[0] > 100 and yellow[1] == 0
+    told, nobody = (name_told(np.full((EDGE, EDGE, 3), 90, np.uint8), roles) for roles in (["estimator"], []))
+    assert (told[: EDGE - BAR] == 90).all() and (told[EDGE - BAR :] < 40).any() and (nobody == 90).all()
 
 
 @pytest.mark.parametrize(("reliability", "period"), [("BEST_EFFORT", GLANCE), ("RELIABLE", 1)])

@@ -155,6 +155,7 @@ def test_a_share_of_no_bags_is_refused(tmp_path):
 def offline(request, recorded, tmp_path_factory, monkeypatch):
     """Return what makes runs that learn from bags alone, in which nothing can be simulated."""
     monkeypatch.setattr(GoalTask, "step", None)
+    monkeypatch.setattr("mujoban_controller.goal_task.World", None)
     config = MPO
     if request.param == "distil":
         teacher, policy = tmp_path_factory.mktemp("teacher") / "teacher.safetensors", PrivilegedPolicy()
