@@ -50,3 +50,14 @@ def ray_cluster():
         cluster = Cluster(cpus=2)
         yield cluster
         cluster.close()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder in the place of that of the results, without any."""
+    from benchmarks.paper import parts, runs
+
+    monkeypatch.setattr(runs, "JSON", tmp_path / "json")
+    monkeypatch.setattr(parts, "PARTS", tmp_path / "parts")
+    (tmp_path / "json").mkdir()
+    return tmp_path

@@ -10,7 +10,7 @@ import pytest
 from paper_pages import write
 
 from benchmarks.paper import __main__ as results
-from benchmarks.paper import baselines, figures, parts, runs, table1, tables
+from benchmarks.paper import baselines, figures, runs, table1, tables
 from bringup.evaluate import evaluate
 from mujoban_baselines.mpo import MPOTrainingConfig
 from mujoban_baselines.task import TaskConfig
@@ -22,15 +22,6 @@ from mujoban_rl.actors import ActorOptions
 from mujoban_sokoban.episodes import Episodes
 
 GUIDE = (Path(__file__).parents[2] / "docs" / "baselines.md").read_text()
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A folder in the place of that of the results, without any."""
-    monkeypatch.setattr(runs, "JSON", tmp_path / "json")
-    monkeypatch.setattr(parts, "PARTS", tmp_path / "parts")
-    (tmp_path / "json").mkdir()
-    return tmp_path
 
 
 @pytest.fixture
