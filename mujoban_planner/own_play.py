@@ -28,6 +28,8 @@ _LEAST, _MOST = 0.003, 0.7
 """A push is audited that is called deadly with a probability between these: of others there is hardly a doubt."""
 _UNDOUBTED: Final = 0.1
 """Share that is learned from of pushes that were played without a doubt, and rightly."""
+_UNKNOWN: Final = 4
+"""States of a level that was lost of which searches could not tell, after which it is left alone."""
 _UNLIKELY: Final = 0.3
 """What makes also pushes that are hardly wanted come into an audit."""
 
@@ -68,6 +70,8 @@ class Lead:
     """Pushes before the first state that is known to leave none, or, while there is no such, all."""
     proved: bool = False
     """Whether that is known of it."""
+    unknown: list[int] = field(default_factory=list)
+    """Pushes before the states of which a search could not tell."""
 
     @property
     def values(self) -> list[Any]:
@@ -89,7 +93,7 @@ class Lead:
         elif lost:
             self.lost, self.proved = self.root, True
         else:
-            self.lost, self.proved = self.alive, False  # nobody knows: the search for it is over
+            self.unknown.append(self.root)
 
     @property
     def found(self) -> bool:
@@ -98,8 +102,12 @@ class Lead:
 
     @property
     def middle(self) -> int | None:
-        """Where the next search begins; None where there is nothing more to find."""
-        return (self.alive + self.lost) // 2 if self.lost - self.alive > 1 else None
+        """Where the next search begins, near the middle; None where there is nothing more to find."""
+        if len(self.unknown) >= _UNKNOWN:
+            return None
+        centre = (self.alive + self.lost) // 2
+        left = [i for i in range(self.alive + 1, self.lost) if i not in self.unknown]
+        return min(left, key=lambda i: abs(i - centre), default=None)
 
 
 class AuditQueue:
