@@ -39,9 +39,10 @@ class LessonStore:
         size, held = self.config.batch_size, {kind: buffer.size for kind, buffer in self.buffers.items()}
         if held["way"] < size:
             return None
-        judged = int(size * self.config.judged) if held["verdict"] > size else 0
+        judged = int(size * self.config.judged)
         freely = {kind: int(judged * share) if held[kind] > size else 0 for kind, share in _JUDGED.items()}
-        counts = {"way": size - judged, "verdict": judged - sum(freely.values()), **freely}
+        proved = judged - sum(freely.values()) if held["verdict"] > size else 0
+        counts = {"way": size - sum(freely.values()) - proved, "verdict": proved, **freely}
         parts = [self.buffers[kind].draw(count, self._rng) for kind, count in counts.items() if count]
         # What is blurred and hidden are the first and the last of a batch: states of all kinds, hence.
         order = self._rng.permutation(size)

@@ -270,9 +270,9 @@ class SearchActor(Actor):
         searching = forest.trees.solution < 0
         grow(forest, np.arange(self.config.trees), self._evaluate)
         solved = np.flatnonzero(searching & (forest.trees.solution >= 0))
-        audited = np.array([self._leads[row].phase is Phase.AUDIT for row in solved.tolist()], np.bool_)
-        self._budgets[solved[audited]] = 0  # that was all
-        solved = solved[~audited]
+        asked = np.array([self._leads[row].root > 0 for row in solved.tolist()], np.bool_)
+        self._budgets[solved[asked]] = 0  # whether there is a solution was all
+        solved = solved[~asked]
         forest.question(solved)
         self._budgets[solved] = forest.expansions[solved] + self.config.questions
 

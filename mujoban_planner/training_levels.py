@@ -38,6 +38,8 @@ _KEPT_FAILURES: Final = 20_000
 _KEPT_LONG: Final = 4096
 _LEAVES: Final = 0.1
 """Chance that a level which was lost at first is not drawn any more once it is won; and a long one whenever it is."""
+_GIVEN_UP: Final = 0.2
+"""The same once it is lost again: else a few that cannot be learned are soon all that comes again."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,8 @@ class TrainingLevels:
 
     def rate(self, ticket: Ticket, solved: bool) -> None:
         """Take note of how a level ended at the first try, or of one that came again for itself at another."""
-        if self._config.mined and not (solved and (not ticket.mined or self._rng.random() < _LEAVES)):
+        leaves = (_LEAVES if solved else _GIVEN_UP) if ticket.mined else float(solved)
+        if self._config.mined and self._rng.random() >= leaves:
             self._keep(self._lost, ticket._replace(mined=True), _KEPT_FAILURES)
         if ticket.mined or ticket.long:
             return

@@ -22,11 +22,26 @@ def test_the_push_that_lost_a_level_is_found_by_few_searches(fatal):
     assert lead.found and lead.alive == fatal and searches <= 3
 
 
-def test_where_a_search_comes_to_nothing_no_push_is_blamed():
-    lead = Lead(Phase.LOST, way=[(i, 0, i) for i in range(8)], lost=8, proved=True)
-    lead.root = lead.middle
-    lead.learn(solved=False, lost=False)
-    assert lead.middle is None and not lead.found
+@pytest.mark.parametrize("fatal", range(7))
+@pytest.mark.parametrize("doubtful", range(1, 7))
+def test_where_a_search_comes_to_nothing_others_beside_it_find_the_push_that_lost(fatal, doubtful):
+    lead, searched = Lead(Phase.LOST, way=[(i, 0, i) for i in range(7)], lost=7, proved=True), []
+    while (root := lead.middle) is not None:
+        lead.root = root
+        searched.append(root)
+        told = root != doubtful
+        lead.learn(solved=told and root <= fatal, lost=told and root > fatal)
+    assert len(searched) == len(set(searched)) <= 5
+    assert lead.found == (doubtful not in (fatal, fatal + 1)), "unless that is a state beside it"
+    assert not lead.found or lead.alive == fatal
+
+
+def test_where_searches_come_to_nothing_no_push_is_blamed():
+    lead, searches = Lead(Phase.LOST, way=[(i, 0, i) for i in range(20)], lost=20, proved=True), 0
+    while (root := lead.middle) is not None:
+        lead.root, searches = root, searches + 1
+        lead.learn(solved=False, lost=False)
+    assert searches == 4 and not lead.found
 
 
 def test_play_that_was_cut_off_blames_no_push_while_all_of_it_leaves_a_solution():
