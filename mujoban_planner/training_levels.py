@@ -47,7 +47,8 @@ class LevelConfig:
     """What decides which levels come again."""
 
     mined: float = 0.0
-    """Share of levels that own play lost when they first came; they come until it has won each several times."""
+    """Share of levels that own play lost when they first came; they come until it has won each several times, or has
+    lost it some five times again."""
     long: float = 0.0
     """Share of the other levels whose own solution is long; each comes about ten times."""
     long_moves: int = 45

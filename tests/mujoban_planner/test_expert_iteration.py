@@ -238,6 +238,17 @@ def test_levels_that_were_lost_at_first_come_until_they_have_been_won_several_ti
     assert levels.success_rates.tolist() == rates, "the mix follows first tries"
 
 
+def test_levels_that_are_lost_again_and_again_are_given_up():
+    levels = TrainingLevels(0, LevelConfig(mined=0.5))
+    levels.rate(levels.draw(1)[1][0], solved=False)
+    losses = 0
+    for _ in range(1000):
+        (ticket,) = levels.draw(1)[1]
+        levels.rate(ticket, solved=not ticket.mined)
+        losses += ticket.mined
+    assert 0 < losses < 60, "about five times"
+
+
 def test_another_seed_plays_other_levels_by_another_chance_and_all_are_for_training():
     seen, chances = [], []
     for seed in (0, 1):
