@@ -190,8 +190,9 @@ def test_turns_on_the_spot_are_nobodys_driving_and_other_torques_are_drawn():
     arrays = actor.act().arrays
     assert decisions_of(actor, 25)
     assert arrays["driven"].all() and np.abs(arrays["action"]).max() <= 1.0
-    assert len(np.unique(arrays["action"][..., 0])) > 4
     assert arrays["first"][0].all() and not arrays["first"][1:].any()
+    later = [actor.act().arrays["action"] for _ in range(3)]  # some of the draws are beyond the limits, which is one
+    assert len(np.unique(np.concatenate([arrays["action"], *later])[..., 0])) > 4
     actor.close()
 
 

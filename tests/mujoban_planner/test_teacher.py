@@ -176,7 +176,7 @@ def test_lost_levels_are_played_again(monkeypatch):
 
 
 def test_planner_errs_where_the_truth_is_another_than_it_says():
-    samples = LessonMaker(4, {1: 1.0}).demonstrations(40)
+    samples = LessonMaker(4, {1: 1.0}).demonstrations(80)
     planner = load()
     unjudged = samples._replace(
         dead_known=np.zeros_like(samples.dead_known), push_known=np.zeros_like(samples.push_known)
