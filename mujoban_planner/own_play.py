@@ -162,7 +162,7 @@ def choose_played(planner: LearnedPlanner, samples: Samples, rng: np.random.Gene
     if output.push_dead is None:
         return samples.take(np.zeros(0, np.int64))
     dead = (output.push_dead.float().sigmoid() * batch.push_known).sum((1, 2, 3)).cpu().numpy()
-    deadly = (batch.push_dead & batch.push_known).any(3).any(2).any(1).cpu().numpy()
+    deadly = (batch.push_dead & batch.push_known).flatten(1).any(1).cpu().numpy()
     return samples.take(((dead > _LEAST) & (dead < _MOST)) | deadly | (rng.random(len(dead)) < _UNDOUBTED))
 
 

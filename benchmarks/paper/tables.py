@@ -37,7 +37,7 @@ def failures(runs: Sequence[Run]) -> str:
     reports = [load(run) for run in runs]
     reasons = sorted({reason for report in reports if report for reason in report["failures"]})
     rows = [
-        [_title(run, report), *(str(report["failures"].get(reason, 0)) for reason in reasons)]
+        [run.title + _mark(run, report), *(str(report["failures"].get(reason, 0)) for reason in reasons)]
         for run, report in zip(runs, reports, strict=True)
         if report
     ]
@@ -148,13 +148,14 @@ def _rates(runs: Sequence[Run]) -> list[str]:
             cells.append(NOT_MEASURED)
             continue
         low, high = report["success_interval"]
-        stale = STALE if is_stale(report, run) else ""
-        cells.append(f"{100 * report['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f}){stale}")
+        rate = f"{100 * report['success_rate']:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+        cells.append(rate + _mark(run, report))
     return ["/".join(map(str, sorted(counts))) or "0", *cells]
 
 
-def _title(run: Run, report: dict[str, Any]) -> str:
-    return run.title + (STALE if is_stale(report, run) else "")
+def _mark(run: Run, report: dict[str, Any]) -> str:
+    """Return what follows a title or a number that was measured with other weights than those that ship now."""
+    return STALE if is_stale(report, run) else ""
 
 
 def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
@@ -169,7 +170,7 @@ def _row(run: Run, report: dict[str, Any] | None) -> list[str]:
     error = returns.std(ddof=1) / np.sqrt(len(returns)) if len(returns) > 1 else float("nan")
     low, high = report["success_interval"]
     return [
-        _title(run, report),
+        run.title + _mark(run, report),
         name,
         oracles,
         str(len(returns)),
