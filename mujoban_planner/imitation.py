@@ -5,6 +5,7 @@ Shapes: B batch, N = `grid.GRID_SIZE`, I = N - 2, A = 5 instructions.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -63,6 +64,9 @@ class LearnerConfig(NetworkConfig):
     """Thinking times, one for each batch in turns."""
     init: str | None = None
     """Weights to start from: of the same or fewer channels and blocks."""
+    init_share: float = 0.0
+    """Their share in what is played and shipped, the rest being the average's: what lies between a network and what a
+    further training makes of it often solves more than both (Wortsman et al. 2022, WiSE-FT)."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -71,7 +75,9 @@ class LearnerConfig(NetworkConfig):
         check_counts(self, "seed", least=0)
         check_positive(self, "learning_rate")
         check_not_negative(self, "weight_decay", "plan_weight", "value_weight", "push_weight", "dead_weight")
-        check_shares(self, "warm_up", "ema")
+        check_shares(self, "warm_up", "ema", "init_share")
+        if self.init_share and self.init is None:
+            raise ValueError(f"init_share is {self.init_share}: expected 0 or an --init to share with")
         if not self.thoughts or min(self.thoughts) < 1:
             raise ValueError(f"--thoughts {' '.join(map(str, self.thoughts))}: expected numbers from 1")
 
@@ -157,6 +163,8 @@ def _verdict_loss(logit: Tensor, batch: Batch) -> Tensor:
 class ImitationLearner(PlannerLearner[Batch]):
     """Trains a network on lessons; the moving average of its weights is what is played and shipped.
 
+    With `LearnerConfig.init_share` these lie between the average and what it began with.
+
     Which average solves the most levels that are seen whole does not tell which does best on estimates: where lessons
     show these, the last one is exported.
     """
@@ -176,7 +184,9 @@ class ImitationLearner(PlannerLearner[Batch]):
         self.config, self.device = config, usable_device(device)
         torch.manual_seed(config.seed)  # the initial weights
         self.network = beginning(config, config.init).to(self.device)
+        self._initial = [parameter.detach().clone() for parameter in self.network.parameters()]
         self._average = moving_average(self.network, config.ema, warm_up=True)
+        self._between = copy.deepcopy(self._average.module)
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, (0.9, 0.98), weight_decay=config.weight_decay, fused=True
         )
@@ -185,8 +195,15 @@ class ImitationLearner(PlannerLearner[Batch]):
 
     @property
     def product(self) -> LearnedPlanner:
-        """The moving average."""
-        return self._average.module
+        """The moving average, or what lies between it and what it began with."""
+        share = self.config.init_share
+        if not share:
+            return self._average.module
+        parts = zip(self._between.parameters(), self._average.module.parameters(), self._initial, strict=True)
+        with torch.no_grad():
+            for between, average, initial in parts:
+                between.copy_(torch.lerp(average, initial, share))
+        return self._between
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -220,7 +237,7 @@ class ImitationLearner(PlannerLearner[Batch]):
         return {f"train/{name}": float(value) for name, value in parts.items()} | {"learning_rate": rate}
 
     def weights(self) -> Mapping[str, Tensor]:
-        """Return the average, whose play is corrected."""
+        """Return the product, whose play is corrected."""
         return self.product.state_dict()
 
 

@@ -316,6 +316,7 @@ def test_every_method_has_a_budget_of_cpu_seconds_and_evaluations_by_samples(tmp
         ("imitation", "--blocks", "0"),
         ("imitation", "--corrections", "1.5"),
         ("imitation", "--learning-rate", "0.0"),
+        ("imitation", "--init-share", "0.5"),
         ("mpo", "--play", "0"),
         ("mpo", "--n-step", "0"),
         ("mpo", "--environments", "0"),
@@ -367,6 +368,25 @@ def test_a_larger_network_begins_with_what_a_smaller_one_says(tmp_path):
     for other in (ResidualPlanner(8, 1, judge=True), RecurrentPlanner(16, propagation=True, judge=True)):
         with pytest.raises(WeightsError, match="at most the channels"):
             start_from(other, path)
+
+
+def test_what_a_run_makes_of_weights_lies_between_both_by_their_share(tmp_path):
+    begun = ResidualPlanner(8, 1, judge=True)
+    save_weights(tmp_path / "init.safetensors", begun, begun.config, {})
+    made = {}
+    for share in (0.0, 0.25, 1.0):
+        run = tmp_path / str(share)
+        trainer = _imitation(run, init=str(tmp_path / "init.safetensors"), init_share=share)
+        trainer.run(limit_samples=64)
+        again = _imitation(run, init=str(tmp_path / "init.safetensors"), init_share=share)
+        again.run(limit_samples=96)
+        made[share] = mujoban_planner.load(run / "planner.safetensors").state_dict()
+        for name, weight in again.learner.weights().items():
+            assert torch.equal(weight, made[share][name])
+    assert any(not torch.equal(weight, made[0.0][name]) for name, weight in begun.state_dict().items())
+    for name, weight in begun.state_dict().items():
+        assert torch.equal(made[1.0][name], weight)
+        torch.testing.assert_close(made[0.25][name], 0.75 * made[0.0][name] + 0.25 * weight)
 
 
 def test_damaged_weights_are_refused(tmp_path):
