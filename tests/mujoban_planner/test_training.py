@@ -295,6 +295,17 @@ def test_every_method_has_a_budget_of_cpu_seconds_and_evaluations_by_samples(tmp
     assert exit_status("train", partial(train.main, arguments)) == 2
     error = capsys.readouterr().err.strip()
     assert re.search(said, error) and len(error.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "option"), [("ppo", "updates"), ("expert-iteration", "updates"), ("imitation", "horizon_samples")]
+)
+def test_a_budget_of_nothing_is_refused_before_anything_begins(tmp_path, method, option):
+    words = [method, "--run", str(tmp_path / "run"), f"--{option}", "nan"]
+    with pytest.raises(ValueError, match=f"^budget of nan {option.removeprefix('horizon_')}: expected a positive"):
+        train.main(words)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
