@@ -198,8 +198,9 @@ def _one_line(box: str, expected: str) -> str:
     parts = _RULE.split("\n".join(row for row in rows if row))
     sections = [part.strip().split("\n") for part in parts if part.strip()]
     wrong = " ".join(sections[0]).removeprefix("Error parsing ")
-    if empty := re.match(r"Missing value for argument '(--\S+)'", wrong):
-        return f"{empty[1]} has no value, expected one"
+    if lacking := re.match(r"Missing value for argument '(--\S+)'\. Expected (\d+)", wrong):
+        option, count = lacking.groups()
+        return f"{option} has " + ("no value, expected one" if count == "1" else f"too few values, expected {count}")
     # How tyro names what a subcommand's options are made of.
     wrong = re.sub(r"^(?:--)?__tyro-dummy-inner__\.(?:\w+\.)*\w+: ", "", wrong)
     # And whose check of all options together it is that failed: that of a class, or of an option.

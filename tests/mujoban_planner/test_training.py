@@ -349,6 +349,8 @@ def test_a_mix_of_no_levels_is_named(tmp_path, capsys, method):
     arguments = [method, "--run", str(tmp_path / "run"), "--mix", "0", "0", "0", "0", "0"]
     assert exit_status("train", partial(train.main, arguments)) == 2
     assert "mix is 0.0 0.0 0.0 0.0 0.0: expected five shares" in capsys.readouterr().err
+    assert exit_status("train", partial(train.main, [*arguments[:4], "1", "2"])) == 2
+    assert capsys.readouterr().err == "train: error: --mix has too few values, expected 5\n"
 
 
 @pytest.mark.parametrize("options", [["imitation"], ["expert-iteration"], ["mpo"], ["stages", "--stages", "ppo=1"]])
