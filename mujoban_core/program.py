@@ -18,8 +18,8 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stderr, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, suppress
 from pathlib import Path
 from typing import Any, Final, NoReturn, TypeVar
 
@@ -137,26 +137,60 @@ def read_options(
     """
     import tyro
 
+    read: Any = tyro.extras.subcommand_cli_from_dict if isinstance(options, Mapping) else tyro.cli
+    with _errors_in_one_line("what --help lists"):
+        return read(
+            options, args=command_line, prog=prog, description=description, config=(tyro.conf.FlagCreatePairsOff,)
+        )
+
+
+def read_changes(settings: OptionsT, words: Sequence[str], expected: str) -> OptionsT:
+    """Return settings with the options that the value of another option names; `--help` is none of them.
+
+    Args:
+        settings: A dataclass; options of those within it need no prefix.
+        words: Options with their values.
+        expected: What to expect in the place of an option that is unknown and resembles none.
+
+    Raises:
+        ValueError: If an option is unknown or its value is not what is expected.
+    """
+    import tyro
+
+    if printing := [word for word in words if word.startswith("--tyro-")]:  # and ending the process
+        raise ValueError(f"unrecognized options: {', '.join(printing)}, expected {expected}")
+    with _errors_in_one_line(expected):
+        return tyro.cli(
+            type(settings), default=settings, args=words, prog="", add_help=False,
+            config=(tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
+        )  # fmt: skip
+
+
+@contextmanager
+def _errors_in_one_line(expected: str) -> Iterator[None]:
+    """Raise a ValueError of one line where tyro would say more and end the process.
+
+    Args:
+        expected: What to expect where tyro does not say it.
+    """
     said = io.StringIO()
     try:
         with redirect_stderr(said):
-            read: Any = tyro.extras.subcommand_cli_from_dict if isinstance(options, Mapping) else tyro.cli
-            return read(
-                options, args=command_line, prog=prog, description=description,
-                config=(tyro.conf.FlagCreatePairsOff,),
-            )  # fmt: skip
+            yield
     except SystemExit as leaving:
         if leaving.code in (0, None):
             raise
-        raise ValueError(_one_line(said.getvalue())) from None
+        raise ValueError(_one_line(said.getvalue(), expected)) from None
 
 
 _BOX: Final = re.compile(r"\x1b\[[0-9;]*m|[│╭╮╰╯]")
 _RULE: Final = re.compile(r"^(?:─+|-{3,})$", re.MULTILINE)
+_CLOSING: Final = "For full helptext"
+"""Start of what tyro says last, of a command that has `--help`."""
 
 
-def _one_line(box: str) -> str:
-    """Return in one line what tyro says in a box: what is wrong, and what it expects.
+def _one_line(box: str, expected: str) -> str:
+    """Return in one line what tyro says in a box: what is wrong, and what it expects, or else what we do.
 
     The first row is the box's title; where stdout is not UTF-8, rules are hyphens.
     """
@@ -164,15 +198,17 @@ def _one_line(box: str) -> str:
     parts = _RULE.split("\n".join(row for row in rows if row))
     sections = [part.strip().split("\n") for part in parts if part.strip()]
     wrong = " ".join(sections[0]).removeprefix("Error parsing ")
-    if empty := re.match(r"Missing value for argument '(--\S+)'", wrong):
-        return f"{empty[1]} has no value, expected one"
+    if lacking := re.match(r"Missing value for argument '(--\S+)'\. Expected (\d+)", wrong):
+        option, count = lacking.groups()
+        return f"{option} has " + ("no value, expected one" if count == "1" else f"too few values, expected {count}")
     # How tyro names what a subcommand's options are made of.
     wrong = re.sub(r"^(?:--)?__tyro-dummy-inner__\.(?:\w+\.)*\w+: ", "", wrong)
-    # And whose check of all options together it is that failed.
-    wrong = re.sub(r"^\w+: (?=--)", "", wrong)
+    # And whose check of all options together it is that failed: that of a class, or of an option.
+    wrong = re.sub(r"^(?:[A-Z]\w*: |\w+: (?=--))", "", wrong)
     if "xpected" in wrong:
         return re.sub(r"^(--[\w-]+): ", r"\1 ", wrong[0].lower() + wrong[1:])
     if missing := re.match(r".*[Mm]issing from .*?: (--\S+)", wrong):
         return f"{missing[1]} is missing, expected it with a value"
-    known = dict.fromkeys(row for part in sections[1:-1] for row in part[1:] if row.startswith("-"))
-    return f"{wrong[0].lower()}{wrong[1:]}, expected {' or '.join(known) or 'what --help lists'}"
+    told = (part[1:] for part in sections[1:] if not part[0].startswith(_CLOSING))
+    known = dict.fromkeys(row for rows in told for row in rows if row.startswith("-"))
+    return f"{wrong[0].lower()}{wrong[1:]}, expected {' or '.join(known) or expected}"

@@ -50,11 +50,17 @@ class ExpertIterationConfig(LearnerConfig):
     """Updates after which it is complete."""
 
     def __post_init__(self) -> None:
-        """Reject numbers with which nothing is learned, and what is no share."""
+        """Reject numbers with which nothing is learned, what is no share, and budgets of nothing."""
         super().__post_init__()
         check_counts(self, "first_evaluations")
         check_positive(self, "evaluations", "learning_rate", "horizon_seconds")
         check_shares(self, "warm_up")
+        _ = self.budget
+
+    @property
+    def budget(self) -> Budget:
+        """When the run is complete."""
+        return Budget(cpu_seconds=self.cpu_seconds, seconds=self.horizon_seconds, updates=self.updates)
 
 
 def expert_iteration(
@@ -87,6 +93,5 @@ def expert_iteration(
         "init": origin(config.init),
         "data": lineage(_DATA, config.init),
     }
-    budget = Budget(cpu_seconds=config.cpu_seconds, seconds=config.horizon_seconds, updates=config.updates)
-    run = RunDirectory(directory, config)
-    return Trainer(run, ImitationLearner(config, config.search, device), source, budget, cadence, record=record)
+    run, learner = RunDirectory(directory, config), ImitationLearner(config, config.search, device)
+    return Trainer(run, learner, source, config.budget, cadence, record=record)

@@ -106,6 +106,12 @@ class ImitationConfig(LessonConfig, LearnerConfig):
             raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
         if self.long_moves > _LONGEST:
             raise ValueError(f"--long-moves {self.long_moves}: expected at most {_LONGEST}, as few levels take more")
+        _ = self.budget
+
+    @property
+    def budget(self) -> Budget:
+        """When the run is complete."""
+        return Budget(self.horizon_samples, seconds=self.horizon_seconds, cpu_seconds=self.cpu_seconds)
 
 
 def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> tuple[Tensor, dict[str, Tensor]]:
@@ -271,8 +277,7 @@ def imitation(
         "bags": [bag.name for bag in bags],
         "bags_digest": bags_digest(bags),
     }
-    budget = Budget(config.horizon_samples, seconds=config.horizon_seconds, cpu_seconds=config.cpu_seconds)
-    return Trainer(run, learner, source, budget, cadence, record=record)
+    return Trainer(run, learner, source, config.budget, cadence, record=record)
 
 
 def _source(config: ImitationConfig, actors: ActorOptions, bags: Sequence[Path], device: str) -> Source[Batch]:

@@ -38,11 +38,12 @@ class PushRunConfig(NetworkConfig):
     """Share of a batch's states in which they are asked."""
 
     def __post_init__(self) -> None:
-        """Reject networks of nothing and seeds that there are not."""
+        """Reject networks of nothing, seeds that there are not, and budgets of nothing."""
         super().__post_init__()
         check_counts(self, "seed", least=0)
         check_not_negative(self, "anchor")
         check_shares(self, "anchored")
+        _ = self.budget
 
     @property
     def budget(self) -> Budget:

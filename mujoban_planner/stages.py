@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from mujoban_core.files import write_atomically
+from mujoban_core.program import read_changes
 from mujoban_core.ranges import check_counts, check_positive
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.growth import beginning
@@ -32,69 +34,59 @@ _PRODUCT: Final = "planner.safetensors"
 _COSTS: Final = ("samples", "updates", "cpu_seconds")
 _NOTED: Final = ("method", "digest", *_COSTS, "metrics")
 """What the record of the whole says of each stage."""
+_OF_BAGS: Final = {"bags", "bag_share", "bag_estimates"}
+"""What methods by themselves are told of recorded bags."""
 
 
 class _Place(NamedTuple):
-    """Where a stage trains, and how often it logs and evaluates."""
+    """Where a stage trains, what it begins with, and how often it logs and evaluates."""
 
     run: Path
     cadence: Cadence
     actors: ActorOptions
     device: str
-
-
-class _Settings(NamedTuple):
-    """What all methods are told."""
-
-    network: NetworkConfig
     init: str | None
-    seed: int
-    cpu_seconds: float
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """All of it, as options of a method's configuration."""
-        return asdict(self.network) | {"init": self.init, "seed": self.seed, "cpu_seconds": self.cpu_seconds}
+    """Weights that it begins with."""
 
 
-def _expert_iteration(settings: _Settings, place: _Place) -> Trainer[Any]:
-    config = ExpertIterationConfig(**settings.options)
+def _expert_iteration(config: ExpertIterationConfig, place: _Place) -> Trainer[Any]:
+    config = replace(config, init=place.init)
     return expert_iteration(config, place.run, place.cadence, place.actors, device=place.device)
 
 
-def _imitation(settings: _Settings, place: _Place) -> Trainer[Any]:
-    config = ImitationConfig(**settings.options, horizon_samples=1e12)
+def _imitation(config: ImitationConfig, place: _Place) -> Trainer[Any]:
+    config = replace(config, init=place.init)
     return imitation(config, place.run, place.cadence, device=place.device, actors=place.actors)
 
 
-def _mpo(settings: _Settings, place: _Place) -> Trainer[Any]:
-    options = settings.options
-    init = options.pop("init")
-    return reinforcement(
-        MPOConfig(**options),
-        place.run,
-        replace(place.cadence, **MPO_PACE),
-        device=place.device,
-        actors=place.actors,
-        init=None if init is None else Path(init),
-    )
+def _mpo(config: MPOConfig, place: _Place) -> Trainer[Any]:
+    cadence, init = replace(place.cadence, **MPO_PACE), None if place.init is None else Path(place.init)
+    return reinforcement(config, place.run, cadence, device=place.device, actors=place.actors, init=init)
 
 
-def _mpo_pushes(settings: _Settings, place: _Place) -> Trainer[Any]:
-    return push_mpo(PushMPOConfig(**settings.options), place.run, place.cadence, place.actors)
+def _mpo_pushes(config: PushMPOConfig, place: _Place) -> Trainer[Any]:
+    return push_mpo(replace(config, init=place.init), place.run, place.cadence, place.actors)
 
 
-def _ppo(settings: _Settings, place: _Place) -> Trainer[Any]:
+def _ppo(config: PushPPOConfig, place: _Place) -> Trainer[Any]:
     cadence = replace(place.cadence, **PPO_PACE)
-    return push_ppo(PushPPOConfig(**settings.options), place.run, cadence, place.actors)
+    return push_ppo(replace(config, init=place.init), place.run, cadence, place.actors)
 
 
-METHODS: Final[Mapping[str, Callable[[_Settings, _Place], Trainer[Any]]]] = {
-    "expert-iteration": _expert_iteration,
-    "imitation": _imitation,
-    "mpo": _mpo,
-    "mpo-pushes": _mpo_pushes,
-    "ppo": _ppo,
+class _Method(NamedTuple):
+    """How a stage may train."""
+
+    config: Any
+    """Its configuration, where a stage has no options of its own."""
+    trainer: Callable[[Any, _Place], Trainer[Any]]
+
+
+METHODS: Final[Mapping[str, _Method]] = {
+    "expert-iteration": _Method(ExpertIterationConfig(), _expert_iteration),
+    "imitation": _Method(ImitationConfig(horizon_samples=1e12), _imitation),
+    "mpo": _Method(MPOConfig(), _mpo),
+    "mpo-pushes": _Method(PushMPOConfig(), _mpo_pushes),
+    "ppo": _Method(PushPPOConfig(), _ppo),
 }
 
 
@@ -107,7 +99,8 @@ class StagesConfig(NetworkConfig):
     blocks: int = 6
     """Residual blocks (residual, thinking)."""
     stages: tuple[str, ...] = ("expert-iteration=0.7", "mpo-pushes=0.3")
-    """Methods in their order, each with its share of the time: expert-iteration, imitation, mpo, mpo-pushes, ppo."""
+    """Methods in their order, each with its share of the time: expert-iteration, imitation, mpo, mpo-pushes, ppo.
+    Options of the method may follow in the same text: "ppo=0.2 --learning-rate 3e-4"."""
     init: str | None = None
     """Weights that the first stage starts from: of the same or fewer channels and blocks."""
     cpu_seconds: float = 10_800.0
@@ -115,33 +108,75 @@ class StagesConfig(NetworkConfig):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Reject networks of nothing, budgets of nothing, and what is no method or no share."""
+        """Reject networks of nothing, budgets of nothing, and what is no method, no share or no option of a stage."""
         super().__post_init__()
         check_counts(self, "seed", least=0)
         check_positive(self, "cpu_seconds")
         _ = self.parsed
 
     @property
-    def parsed(self) -> list[tuple[str, float]]:
-        """Methods with their shares of the time, which add up to 1.
+    def parsed(self) -> list[tuple[str, Any]]:
+        """Methods with their configurations, but for the weights that they begin with; shares are those of the time.
 
         Raises:
-            ValueError: If a method is unknown or a share is not positive.
+            ValueError: If a method is unknown, a share is not positive, or an option is no stage's or out of its range.
         """
-        pairs = []
-        for text in self.stages:
-            method, _, share = text.partition("=")
-            try:
-                weight = float(share)
-            except ValueError:
-                weight = math.nan
-            if method not in METHODS or not 0.0 < weight < math.inf:
-                raise ValueError(f"--stages {text}: expected METHOD=SHARE with a method among {', '.join(METHODS)}")
-            pairs.append((method, weight))
-        if not pairs:
+        read = [_read_stage(text) for text in self.stages]
+        if not read:
             raise ValueError("--stages: expected at least one METHOD=SHARE")
-        total = sum(weight for _, weight in pairs)
-        return [(method, weight / total) for method, weight in pairs]
+        total = sum(weight for _, weight, _ in read)
+        stages = []
+        for i, (method, weight, own) in enumerate(read):
+            seed = len(read) * self.seed + i  # each stage has levels of its own
+            whole = asdict(self.network) | {"seed": seed, "cpu_seconds": weight / total * self.cpu_seconds}
+            stages.append((method, replace(own, **whole)))
+        return stages
+
+
+_WHOLE: Final = {
+    *(option.name for settings in (StagesConfig, ActorOptions) for option in fields(settings)),
+    *("run", "device", "seconds", "threads", "evaluate_every", "evaluate_samples", "save_every"),
+}
+"""What the whole run is told, and no stage."""
+
+
+def _read_stage(text: str) -> tuple[str, float, Any]:
+    """Return the method, the weight of its share, and the configuration with options of its own that a text tells of.
+
+    Raises:
+        ValueError: If it is not METHOD=SHARE, options behind it.
+    """
+    try:
+        first, *options = shlex.split(text) or [""]
+    except ValueError as error:
+        raise ValueError(f"--stages {text}: {error}, expected words as a shell splits them") from None
+    method, _, share = first.partition("=")
+    try:
+        weight = float(share)
+    except ValueError:
+        weight = math.nan
+    if method not in METHODS or not 0.0 < weight < math.inf:
+        raise ValueError(f"--stages {text}: expected METHOD=SHARE with a method among {', '.join(METHODS)}")
+    try:
+        return method, weight, _with_options(method, options)
+    except ValueError as error:
+        raise ValueError(f"--stages {text}: {error}") from None
+
+
+def _with_options(method: str, options: Sequence[str]) -> Any:
+    """Return the configuration of a method with options of a stage's own.
+
+    Raises:
+        ValueError: If one is unknown, out of its range, or no stage's.
+    """
+    for option in (word.partition("=")[0] for word in options if word.startswith("--")):
+        name = option.removeprefix("--").replace("-", "_").removeprefix("no_")
+        if name in _WHOLE:
+            raise ValueError(f"{option} is the whole run's, expected outside of a stage's text")
+        if name in _OF_BAGS:
+            raise ValueError(f"{option} is of bags, expected none, as no stage reads any")
+    own = METHODS[method].config
+    return read_changes(own, options, f"what `train {method} --help` lists as config options") if options else own
 
 
 def train_stages(
@@ -172,13 +207,11 @@ def train_stages(
     RunDirectory(directory, config)
     time, init = TimeLimit(seconds), config.init
     folders = []
-    for i, (method, share) in enumerate(config.parsed, 1):
+    for i, (method, settings) in enumerate(config.parsed, 1):
         folders.append(directory / f"{i}_{method}")
-        seed = len(config.parsed) * config.seed + i - 1  # each stage has levels of its own
-        settings = _Settings(config.network, init, seed, share * config.cpu_seconds)
         # What it begins with counts as a product: a stage that only makes it worse leaves it as it is.
         judging = replace(cadence, evaluate_first=cadence.evaluate_first or init is not None)
-        trainer = METHODS[method](settings, _Place(folders[-1], judging, actors, device))
+        trainer = METHODS[method].trainer(settings, _Place(folders[-1], judging, actors, device, init))
         product = folders[-1] / _PRODUCT
         if trainer.complete and trainer.judged and product.exists():
             trainer.source.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -48,7 +49,7 @@ def provenance() -> dict[str, Any]:
     spec = getattr(main, "__spec__", None)
     if spec is not None and spec.name:
         command = ["python", "-m", spec.name.removesuffix(".__main__"), *sys.argv[1:]]
-    return {"command": " ".join(command), "commit": commit_of(Path(__file__)), "torch": torch.__version__}
+    return {"command": shlex.join(command), "commit": commit_of(Path(__file__)), "torch": torch.__version__}
 
 
 def origin(path: str | Path | None) -> str | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mujoban_core.program import exit_status, read_options
+from mujoban_core.program import exit_status, read_changes, read_options
 from mujoban_core.reports import give_report
 
 PROGRAM = """
@@ -99,6 +99,31 @@ def test_what_all_options_together_reject_begins_with_the_option():
 
     with pytest.raises(ValueError, match=r"^--hours 0\.0: expected more than 0$"):
         read_options(Options, ["--hours", "0"], "program")
+
+
+def test_options_in_the_value_of_another_change_settings_and_fail_without_names_of_classes():
+    @dataclass
+    class Inner:
+        steps: int = 8
+
+    @dataclass
+    class Settings:
+        reuse: float = 1.0
+        inner: Inner = field(default_factory=Inner)
+
+        def __post_init__(self):
+            if self.reuse <= 0:
+                raise ValueError(f"reuse is {self.reuse}: expected more than 0")
+
+    settings = Settings(2.0)
+    assert read_changes(settings, ["--steps", "4"], "others") == Settings(2.0, Inner(4)) != settings
+    for words, said in (
+        (["--reuse", "0"], r"^reuse is 0\.0: expected more than 0$"),
+        (["--bogus"], "^unrecognized options: --bogus, expected others$"),
+        (["--help"], "^unrecognized options: --help, expected others$"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            read_changes(settings, words, "others")
 
 
 def test_an_option_of_many_subcommands_is_proposed_once():

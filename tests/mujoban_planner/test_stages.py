@@ -6,6 +6,8 @@ import json
 import math
 import os
 import signal
+from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,13 @@ from mujoban_core.files import digest
 from mujoban_core.grid import GRID_SIZE
 from mujoban_core.signals import Interrupted
 from mujoban_planner import load, stages, train
+from mujoban_planner.expert_iteration import ExpertIterationConfig
+from mujoban_planner.imitation import ImitationConfig
 from mujoban_planner.push_actor import PlayConfig
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
 from mujoban_planner.push_ppo import PushPPOConfig, push_ppo
 from mujoban_planner.push_run import training_record
+from mujoban_planner.reinforcement import MPOConfig
 from mujoban_planner.stages import StagesConfig, train_stages
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.actors import ActorOptions
@@ -37,21 +42,34 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Make methods tiny, and note what each was told."""
     told: list[Any] = []
 
-    def tiny(kind: Any, make: Any, **size: Any) -> Any:
-        def method(settings: Any, place: Any) -> Trainer[Any]:
-            told.append(settings)
-            config = kind(**settings.options, play=PLAY, updates=3, **size)
-            trainer = make(config, place.run, place.cadence, place.actors)
+    def tiny(config: Any, make: Any) -> stages._Method:
+        def method(config: Any, place: Any) -> Trainer[Any]:
+            told.append(replace(config, init=place.init))
+            trainer = make(told[-1], place.run, place.cadence, place.actors)
             trainer.learner.evaluate = dict
             return trainer
 
-        return method
+        return stages._Method(config, method)
 
-    ppo = tiny(PushPPOConfig, push_ppo, minibatch=32)
-    mpo = tiny(PushMPOConfig, push_mpo, batch_size=32, first_steps=64, replay_steps=40, n_step=3)
-    monkeypatch.setattr(stages, "METHODS", {"ppo": ppo, "mpo-pushes": mpo})
+    ppo = tiny(PushPPOConfig(play=PLAY, updates=3, minibatch=32), push_ppo)
+    small = PushMPOConfig(play=PLAY, updates=3, batch_size=32, first_steps=64, replay_steps=40, n_step=3)
+    monkeypatch.setattr(stages, "METHODS", {"ppo": ppo, "mpo-pushes": tiny(small, push_mpo)})
     torch.set_num_threads(1)
     return told
+
+
+def changed(monkeypatch: pytest.MonkeyPatch, change: Callable[[Trainer[Any], Any], None]) -> None:
+    """Change the trainer of every stage, of which the place is told as well."""
+
+    def changing(method: stages._Method) -> stages._Method:
+        def make(config: Any, place: Any) -> Trainer[Any]:
+            trainer = method.trainer(config, place)
+            change(trainer, place)
+            return trainer
+
+        return method._replace(trainer=make)
+
+    monkeypatch.setattr(stages, "METHODS", {name: changing(method) for name, method in stages.METHODS.items()})
 
 
 def test_each_stage_begins_with_the_planner_of_the_one_before(tmp_path: Path, started: list[Any]) -> None:
@@ -71,15 +89,10 @@ def test_each_stage_begins_with_the_planner_of_the_one_before(tmp_path: Path, st
 def test_a_stage_that_only_makes_its_planner_worse_leaves_it_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: list[Any]
 ) -> None:
-    def judged(method: Any) -> Any:
-        def make(settings: Any, place: Any) -> Trainer[Any]:
-            trainer = method(settings, place)
-            del trainer.learner.evaluate
-            return trainer
+    def judged(trainer: Trainer[Any], place: Any) -> None:
+        del trainer.learner.evaluate
 
-        return make
-
-    monkeypatch.setattr(stages, "METHODS", {name: judged(method) for name, method in stages.METHODS.items()})
+    changed(monkeypatch, judged)
     rates = iter([0.5, 0.5, 0.2])  # the first stage's, what the second begins with, what that makes of it
     monkeypatch.setattr("mujoban_planner.product.success_rates", lambda planner: {"success_rate/5": next(rates)})
     assert train_stages(CONFIG, tmp_path, OFTEN, ActorOptions())
@@ -114,22 +127,16 @@ def test_a_stage_whose_last_evaluation_was_cut_short_is_judged_when_the_run_goes
 ) -> None:
     judged: list[str] = []
 
-    def interrupted(method: Any) -> Any:
-        def make(settings: Any, place: Any) -> Trainer[Any]:
-            trainer = method(settings, place)
+    def interrupted(trainer: Trainer[Any], place: Any) -> None:
+        def judge() -> dict[str, float]:
+            judged.append(place.run.name)
+            if len(judged) == 1:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return {}
 
-            def judge() -> dict[str, float]:
-                judged.append(place.run.name)
-                if len(judged) == 1:
-                    os.kill(os.getpid(), signal.SIGTERM)
-                return {}
+        trainer.learner.evaluate = judge
 
-            trainer.learner.evaluate = judge
-            return trainer
-
-        return make
-
-    monkeypatch.setattr(stages, "METHODS", {name: interrupted(method) for name, method in stages.METHODS.items()})
+    changed(monkeypatch, interrupted)
     with pytest.raises(Interrupted):
         train_stages(CONFIG, tmp_path, OFTEN, ActorOptions())
     assert train_stages(CONFIG, tmp_path, OFTEN, ActorOptions())
@@ -150,8 +157,8 @@ def test_every_method_exports_the_planner_that_solved_most_held_out_levels(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def make() -> Trainer[Any]:
-        settings = stages._Settings(NetworkConfig(channels=8, blocks=1), None, seed=0, cpu_seconds=1e9)
-        return stages.METHODS[method](settings, stages._Place(tmp_path, OFTEN, ActorOptions(), "cpu"))
+        config = replace(stages.METHODS[method].config, channels=8, blocks=1, cpu_seconds=1e9)
+        return stages.METHODS[method].trainer(config, stages._Place(tmp_path, OFTEN, ActorOptions(), "cpu", None))
 
     rates = [{"success_rate/5": 0.5, "success_rate/4": 0.7}, {"success_rate/5": 0.4, "success_rate/4": 0.9}]
     found = iter(rates)
@@ -245,3 +252,87 @@ def test_a_run_from_before_there_were_other_networks_goes_on(tmp_path: Path, sta
 def test_bad_stages_are_named(text: str) -> None:
     with pytest.raises(ValueError, match=r"--stages .*: expected METHOD=SHARE with a method among"):
         StagesConfig(stages=(text,))
+
+
+OWN = replace(CONFIG, stages=("ppo=1 --epochs 2 --steps 2", "mpo-pushes=3 --learning-rate 2e-4 --no-time-outs-lost"))
+
+
+def stored(run: Path, stage: str) -> dict[str, Any]:
+    """Return the configuration that a stage of a run keeps."""
+    return json.loads((run / stage / "config.json").read_text())
+
+
+def test_options_in_the_text_of_a_stage_are_those_of_its_method_alone(tmp_path: Path, started: list[Any]) -> None:
+    assert train_stages(CONFIG, tmp_path / "plain", OFTEN, ActorOptions())
+    assert train_stages(OWN, tmp_path / "own", OFTEN, ActorOptions())
+    plain, ppo = (stored(tmp_path / run, "1_ppo") for run in ("plain", "own"))
+    assert ppo == plain | {"epochs": 2, "play": plain["play"] | {"steps": 2}} != plain
+    plain, mpo = (stored(tmp_path / run, "2_mpo-pushes") for run in ("plain", "own"))
+    init = {"init": str(tmp_path / "own" / "1_ppo" / "planner.safetensors")}
+    assert mpo == plain | init | {"learning_rate": 2e-4, "time_outs_lost": False}
+
+
+def test_a_run_with_other_options_of_a_stage_is_another(tmp_path: Path, started: list[Any]) -> None:
+    assert not train_stages(OWN, tmp_path, OFTEN, ActorOptions(), seconds=0.0)
+    other = replace(OWN, stages=("ppo=1 --epochs 3 --steps 2", *OWN.stages[1:]))
+    with pytest.raises(RunError, match=r"stages: .*--epochs 2 .* there, .*--epochs 3 .* now"):
+        train_stages(other, tmp_path, OFTEN, ActorOptions())
+    assert train_stages(OWN, tmp_path, OFTEN, ActorOptions())
+
+
+def test_a_stage_without_options_has_those_that_it_always_had() -> None:
+    whole = {"channels": 48, "blocks": 6, "cpu_seconds": 21_600 / 5}
+    expected = [
+        ExpertIterationConfig(**whole, seed=20), ImitationConfig(**whole, seed=21, horizon_samples=1e12),
+        MPOConfig(**whole, seed=22), PushMPOConfig(**whole, seed=23), PushPPOConfig(**whole, seed=24),
+    ]  # fmt: skip
+    texts = tuple(f"{name}=0.2" for name in sorted(stages.METHODS))
+    assert [own for _, own in StagesConfig(stages=texts, cpu_seconds=21_600, seed=4).parsed] == expected
+
+
+def test_options_of_settings_within_a_methods_are_named_without_a_prefix() -> None:
+    ((_, own),) = StagesConfig(stages=("expert-iteration=1 --mined 0.25 --led=1 --thoughts 1 2",)).parsed
+    assert (own.search.mined, own.search.led, own.thoughts) == (0.25, 1.0, (1, 2))
+    ((_, own),) = StagesConfig(stages=("imitation=1 --horizon-samples 5e6",)).parsed
+    assert own.horizon_samples == 5e6
+
+
+LISTED = "expected what `train ppo --help` lists as config options"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("ppo=1 --lerning-rate 3", "unrecognized options: --lerning-rate, 3, expected --learning-rate FLOAT"),
+        ("ppo=1 --bogus 3", f"unrecognized options: --bogus, 3, {LISTED}"),
+        ("ppo=1 --help", f"unrecognized options: --help, {LISTED}"),
+        ("ppo=1 --tyro-print-completion bash", f"unrecognized options: --tyro-print-completion, {LISTED}"),
+        ("ppo=1 --epochs 2.5", "--epochs: invalid literal for int() with base 10: '2.5', expected --epochs INT"),
+        ("ppo=1 --epochs", "--epochs has no value, expected one"),
+        ("ppo=1 --epochs 0", "epochs is 0: expected at least 1"),
+        ("ppo=1 --updates nan", "budget of nan updates: expected a positive number"),
+        ("ppo=1 --seed=3", "--seed is the whole run's, expected outside of a stage's text"),
+        ("ppo=1 --no-judge", "--no-judge is the whole run's, expected outside of a stage's text"),
+        ("mpo=1 --init x", "--init is the whole run's, expected outside of a stage's text"),
+        ("mpo=1 --bag_share 1", "--bag_share is of bags, expected none, as no stage reads any"),
+        ("ppo=1 --epochs '2", "No closing quotation, expected words as a shell splits them"),
+    ],
+)
+def test_a_bad_option_of_a_stage_is_named_before_anything_is_written(text: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError) as error:
+        StagesConfig(stages=("imitation=1", text))
+    assert str(error.value) == f"--stages {text}: {said}"
+    with pytest.raises(ValueError) as error:
+        train.main(["stages", "--run", str(tmp_path / "run"), "--stages", "imitation=1", text])
+    assert str(error.value) == f"--stages {text}: {said}"
+    assert not (tmp_path / "run").exists()
+
+
+def test_all_options_of_the_whole_run_are_refused_in_a_stage_and_none_of_its_methods() -> None:
+    whole = {option.name for kind in (train.Stages, StagesConfig, ActorOptions) for option in fields(kind)}
+    for name in whole - {"config"}:
+        with pytest.raises(ValueError, match=f"--{name} is the whole run's"):
+            StagesConfig(stages=(f"ppo=1 --{name} 1",))
+    shared = {option.name for option in fields(NetworkConfig)} | {"init", "seed", "cpu_seconds"}
+    for method in stages.METHODS.values():
+        assert stages._WHOLE & {option.name for option in fields(method.config)} <= shared

@@ -295,6 +295,17 @@ def test_every_method_has_a_budget_of_cpu_seconds_and_evaluations_by_samples(tmp
     assert exit_status("train", partial(train.main, arguments)) == 2
     error = capsys.readouterr().err.strip()
     assert re.search(said, error) and len(error.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "option"), [("ppo", "updates"), ("expert-iteration", "updates"), ("imitation", "horizon_samples")]
+)
+def test_a_budget_of_nothing_is_refused_before_anything_begins(tmp_path, method, option):
+    words = [method, "--run", str(tmp_path / "run"), f"--{option}", "nan"]
+    with pytest.raises(ValueError, match=f"^budget of nan {option.removeprefix('horizon_')}: expected a positive"):
+        train.main(words)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
@@ -339,6 +350,8 @@ def test_a_mix_of_no_levels_is_named(tmp_path, capsys, method):
     arguments = [method, "--run", str(tmp_path / "run"), "--mix", "0", "0", "0", "0", "0"]
     assert exit_status("train", partial(train.main, arguments)) == 2
     assert "mix is 0.0 0.0 0.0 0.0 0.0: expected five shares" in capsys.readouterr().err
+    assert exit_status("train", partial(train.main, [*arguments[:4], "1", "2"])) == 2
+    assert capsys.readouterr().err == "train: error: --mix has too few values, expected 5\n"
 
 
 @pytest.mark.parametrize("options", [["imitation"], ["expert-iteration"], ["mpo"], ["stages", "--stages", "ppo=1"]])

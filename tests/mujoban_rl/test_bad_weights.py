@@ -2,8 +2,10 @@
 
 import json
 import os
+import shlex
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -125,3 +127,9 @@ def test_a_record_names_the_commit_of_this_code_and_of_no_other(tmp_path, monkey
     git("add", "weights.py")
     git("commit", "-q", "-m", "this one")
     assert w.provenance()["commit"] == git("rev-parse", "HEAD").stdout.decode().strip()
+
+
+def test_a_recorded_command_is_read_back_word_by_word(monkeypatch):
+    words = ["train.py", "--stages", "ppo=1 --epochs 2", "--run", "it's here"]
+    monkeypatch.setattr(sys, "argv", words)
+    assert shlex.split(w.provenance()["command"])[-4:] == words[1:]
