@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
-from mujoban_planner.imitation import ImitationLearner, LearnerConfig
+from mujoban_planner.imitation import ImitationLearner, LearnerConfig, check_init_share
 from mujoban_planner.lesson_store import LessonStore
 from mujoban_planner.samples import Batch
 from mujoban_planner.search_lessons import SearchActor, SearchConfig
@@ -78,7 +78,9 @@ def expert_iteration(
 
     Raises:
         RunError: If the directory belongs to another run.
+        ValueError: If weights are to have a share that there are none of.
     """
+    check_init_share(config)
     searcher = partial(SearchActor, config.network, config.search, config.seed, device=device)
     source = ActorSource(
         (actors or ActorOptions()).pool(searcher),

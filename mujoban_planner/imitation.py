@@ -76,8 +76,6 @@ class LearnerConfig(NetworkConfig):
         check_positive(self, "learning_rate")
         check_not_negative(self, "weight_decay", "plan_weight", "value_weight", "push_weight", "dead_weight")
         check_shares(self, "warm_up", "ema", "init_share")
-        if self.init_share and self.init is None:
-            raise ValueError(f"init_share is {self.init_share}: expected 0 or an --init to share with")
         if not self.thoughts or min(self.thoughts) < 1:
             raise ValueError(f"--thoughts {' '.join(map(str, self.thoughts))}: expected numbers from 1")
 
@@ -112,6 +110,12 @@ class ImitationConfig(LessonConfig, LearnerConfig):
     def budget(self) -> Budget:
         """When the run is complete."""
         return Budget(self.horizon_samples, seconds=self.horizon_seconds, cpu_seconds=self.cpu_seconds)
+
+
+def check_init_share(config: LearnerConfig) -> None:
+    """Raise ValueError if weights are to have a share that there are none of."""
+    if config.init_share and config.init is None:
+        raise ValueError(f"init_share is {config.init_share}: expected 0, or an --init whose share it is")
 
 
 def imitation_loss(planner: nn.Module, batch: Batch, config: LearnerConfig) -> tuple[Tensor, dict[str, Tensor]]:
@@ -264,7 +268,9 @@ def imitation(
     Raises:
         RunError: If the directory belongs to another run.
         BagError: If a bag is not what is expected.
+        ValueError: If weights are to have a share that there are none of.
     """
+    check_init_share(config)
     run = RunDirectory(directory, config)
     learner = ImitationLearner(config, config, device)
     source = _source(config, actors or ActorOptions(), bags, device)
