@@ -23,6 +23,7 @@ from mujoban_core.bodies import ANT
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import ANOTHER_RUN, Received
 from mujoban_msgs_py.run_identifier import run_of
+from mujoban_msgs_py.runtime import diagnostics
 from mujoban_msgs_py.topics import TICK
 from mujoban_sokoban.episodes import Episodes
 
@@ -161,6 +162,19 @@ def test_every_node_says_on_diagnostics_how_it_is(play_graph):
     assert set(heard) == {f"/{name}" for name in NODES}
     planner = {value.key: value.value for value in heard["/planner"].values}
     assert "dropped messages" in planner and planner["module"] == "oracle (privileged)"
+
+
+def test_who_begins_to_listen_is_told_at_once_how_each_node_is(play_graph, monkeypatch):
+    monkeypatch.setattr(diagnostics, "PERIOD", 1000.0)
+    graph, heard = play_graph(), []
+    for _ in range(2):
+        names = set()
+        graph.tap.create_subscription(
+            DiagnosticArray, "/diagnostics", lambda m, names=names: names.update(s.name for s in m.status), 10
+        )
+        heard.append(names)
+        graph.spin_until(lambda names=names: len(names) == len(NODES))
+    assert heard == 2 * [{f"/{name}" for name in NODES}]
 
 
 def test_processes_that_are_killed_are_started_again(ros, oracles):
