@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Self
 
-from mujoban_core.plugins import PRIVILEGED, privileged_roles
+from mujoban_core.plugins import PRIVILEGED, TOLD, privileged_roles
 from mujoban_core.stats import wilson_interval
 
 
@@ -116,7 +116,7 @@ def summary(content: Mapping[str, Any]) -> list[str]:
         lines.append(f"lost by {cause}: {count} (seeds {', '.join(seeds[:SEEDS_SHOWN])}{more})")
     if content["privileged"]:
         told = ", ".join(f"{role}: {_brief(content['weights'][role])}" for role in content["privileged"])
-        lines.append(f"privileged, told the ground truth: {told}")
+        lines.append(f"{TOLD}: {told}")
     return lines + [f"{event}: {count}" for event, count in sorted(content.get("counts", {}).items())]
 
 
