@@ -15,7 +15,7 @@ _PLAYING: Final = (*ROLES, AGENT)
 
 
 def players(message: DiagnosticArray, before: Mapping[str, str]) -> dict[str, str]:
-    """Return role -> what plays it: what a message says of modules or an agent, and else what was said `before`.
+    """Return role -> what plays it, as reports have them: what a message says, and else what was said `before`.
 
     An agent takes the place of all four modules, and they its: who looks on may see one run after the other.
     """
@@ -26,7 +26,8 @@ def players(message: DiagnosticArray, before: Mapping[str, str]) -> dict[str, st
         if role in _PLAYING and MODULE in said:
             found[role] = played(said[MODULE], said.get(WEIGHTS, ""))
     kept = before if not found or (AGENT in found) == (AGENT in before) else {}
-    return {**kept, **found}
+    merged = {**kept, **found}
+    return {role: merged[role] for role in _PLAYING if role in merged}
 
 
 def played(module: str, weights: str) -> str:

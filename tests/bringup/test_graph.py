@@ -158,7 +158,8 @@ def test_every_node_says_on_diagnostics_how_it_is(play_graph):
     graph.tap.create_subscription(
         DiagnosticArray, "/diagnostics", lambda message: heard.update({s.name: s for s in message.status}), 10
     )
-    graph.spin_until(lambda: len(heard) == len(NODES) and heard["/simulator"].message == "running")
+    shown = {"/simulator": "running", "/planner": "answering (privileged)"}
+    graph.spin_until(lambda: len(heard) == len(NODES) and all(heard[n].message == said for n, said in shown.items()))
     assert set(heard) == {f"/{name}" for name in NODES}
     planner = {value.key: value.value for value in heard["/planner"].values}
     assert "dropped messages" in planner and planner["module"] == "oracle (privileged)"

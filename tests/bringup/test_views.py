@@ -43,9 +43,10 @@ ENTITIES = {
 class Listener(Node):
     def __init__(self):
         super().__init__("listener")
-        self.grids, self.scenes = [], []
+        self.grids, self.scenes, self.modules = [], [], {}
         self.create_subscription(OccupancyGrid, "/viz/ground_truth/wall", self.grids.append, 10)
         self.create_subscription(MarkerArray, "/viz/scene", self.scenes.append, 10)
+        self.create_subscription(DiagnosticArray, "/diagnostics", lambda m: self.modules.update(players(m, {})), 10)
 
 
 def test_an_occupancy_grid_begins_in_the_south_west():
@@ -65,13 +66,27 @@ def test_standard_tools_see_the_layers_and_the_scene(play_graph):
     graph = play_graph(episodes=episodes)
     listener = graph.graph.add(Listener())
     graph.graph.add(VizNode())
-    graph.spin_until(lambda: listener.grids and listener.scenes and len(listener.scenes[-1].markers) == 4)
+    graph.spin_until(lambda: listener.grids and listener.scenes and len(listener.scenes[-1].markers) == 5)
     percent = np.array(listener.grids[-1].data).reshape(10, 10)[::-1]
     assert (percent == 100 * level[..., WALL]).all()
     markers = {marker.ns: marker for marker in listener.scenes[-1].markers}
     assert len(markers["target"].points) == level[..., TARGET].sum()
     assert len(markers["box"].points) == level[..., BOX].sum()
     assert markers["robot"].type == Marker.ARROW
+
+
+@pytest.mark.parametrize("told", ["planner", ""])
+def test_the_scene_of_standard_tools_names_who_is_told_the_truth(play_graph, fresh_weights, told):
+    planner = Choice("planner", "oracle") if told else Choice("planner")
+    graph = play_graph(Stack(fresh_weights.choices | {"planner": planner}), Episodes(99, 0, difficulty=1))
+    listener = graph.graph.add(Listener())
+    graph.graph.add(VizNode())
+    graph.spin_until(lambda: listener.modules.keys() == ROLES.keys())
+    del listener.scenes[:]
+    graph.spin_until(lambda: len(listener.scenes) > 2)
+    (text,) = [marker for marker in listener.scenes[-1].markers if marker.type == Marker.TEXT_VIEW_FACING]
+    assert (text.action == Marker.ADD) == bool(told)
+    assert text.action == Marker.DELETE or text.text == "privileged, told the ground truth:\nplanner"
 
 
 def test_the_live_view_names_torques_by_their_joints_whatever_the_body():
