@@ -18,7 +18,7 @@ from bringup import keep
 from bringup.model_card import Place, Score, card
 from bringup.pipeline import Entry, Pipeline, Stage
 from bringup.stage_sections import sections
-from mujoban_core.files import write_atomically
+from mujoban_core.files import brief, write_atomically
 from mujoban_core.text import readable
 from mujoban_planner.deliberation import LOOK_AHEAD
 from mujoban_rl.metrics import METRICS, read_metrics
@@ -241,4 +241,4 @@ def _origins(pipeline: Pipeline) -> Iterator[str]:
             yield f"  - by commit {told['commit'] or 'unknown'}, torch {told['torch']}, {cores}"
         for direction, digests in (("from", entry.inputs), ("made", entry.outputs)):
             for name, digest in digests.items():
-                yield f"  - {direction} `{name}`, SHA-256 {digest[:16]}"
+                yield f"  - {direction} `{name}`, SHA-256 {brief(digest)}"
