@@ -2,7 +2,8 @@
 
 A body that no script drives has its privileged teacher among them. ``python -m benchmarks.oracles --levels 512`` prints
 JSON: solved levels with a 95 % Wilson interval, return, steps and instructions per episode, instructions that ran into
-their limit, the steps that an instruction takes, by kind, and, of levels kept for tests, that they were used.
+their limit, the steps that an instruction takes, by kind, what plays and is told the ground truth, and, of levels kept
+for tests, that they were used.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from bringup.command import Stack, oracle
 from bringup.options import WorldOptions
 from bringup.progress import EpisodesBar
 from bringup.rollout import ticks
-from mujoban_core.plugins import ROLES
+from mujoban_core.plugins import ROLES, privileged_roles
 from mujoban_core.ranges import check_counts
 from mujoban_core.stats import wilson_interval
 from mujoban_rl.sealed_levels import noted_use
@@ -57,7 +58,8 @@ def run(options: Options | None = None) -> dict[str, Any]:
     body = options.physics.body
     stack = Stack({role: oracle(role, body) for role in ROLES}, body=body)
     seeds = range(options.seed, options.seed + options.levels)
-    noted = noted_use(seeds, stack.identities(), {"program": PROG, **asdict(options)})
+    weights = stack.identities()
+    noted = noted_use(seeds, weights, {"program": PROG, **asdict(options)})
     episodes = list(Episodes(options.levels, options.seed, difficulty=options.difficulty))
     batch = min(options.batch, len(episodes))
     world = World(batch, body=body, world=options.physics.world, threads=options.threads)
@@ -98,6 +100,8 @@ def run(options: Options | None = None) -> dict[str, Any]:
         },
         "unsolved_seeds": unsolved,
         "seconds": time.perf_counter() - start,
+        "weights": weights,
+        "privileged": privileged_roles(weights),
         **noted,
     }
 

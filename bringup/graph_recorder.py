@@ -45,6 +45,7 @@ class RecorderNode(GraphNode):
         episodes_per_file: Episodes after which the next file of the bag begins.
         instructed: Whether four modules play; if not, an agent, of which there are torques alone.
         body, world: Of the robot and of the physics, which the bag names; empty: it does not.
+        privileged: Roles that are told the ground truth, which the bag names, or `none`; empty: it does not.
         run: Identifier of the run that is recorded; -1 for any.
 
     Attributes:
@@ -65,9 +66,11 @@ class RecorderNode(GraphNode):
         whose = described("whether modules give instructions; an agent alone does not", fixed=True)
         self._answers = MODULE_TOPICS if declare(self, "instructed", True, whose) else (topics.TORQUE,)
         room = "boxes for which the world has room, for the bag to name; 0: not known"
+        told = "roles that are told the ground truth, or none, for the bag to name"
         about = {
             "body": declare(self, "body", "", described("the robot's body, for the bag to name", fixed=True)),
             "world": declare(self, "world", "", described("the physical world, for the bag to name", fixed=True)),
+            "privileged": declare(self, "privileged", "", described(told, fixed=True)),
             "max_boxes": declare(self, "max_boxes", 0, described(room, fixed=True, low=0, high=GRID_SIZE**2)),
         }
         self.run = declare_run(self)

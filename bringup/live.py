@@ -26,14 +26,13 @@ from mujoban_msgs.msg import AbstractState, EpisodeTruth, Instruction, Terminati
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
 
-from bringup.live_layout import CELL, ESTIMATE, TRUTH, Shown, arrow, blueprint, describe, played, text, torque_curves
+from bringup.live_layout import CELL, ESTIMATE, TRUTH, Shown, arrow, blueprint, describe, text, told, torque_curves
 from bringup.live_server import LiveServer
 from bringup.options import LOOPBACK
 from bringup.overlay import grid_picture
+from bringup.players import players
 from mujoban_core.grid import AGENT, CHANNELS
 from mujoban_core.grid import Instruction as Direction
-from mujoban_core.plugins import AGENT as ALONE
-from mujoban_core.plugins import ROLES
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
@@ -41,7 +40,6 @@ from mujoban_msgs_py.listening import belongs, reject
 from mujoban_msgs_py.raw import raw_stamp, read
 from mujoban_msgs_py.runtime import diagnostics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, declare_run, described
-from mujoban_msgs_py.runtime.diagnostics import MODULE, WEIGHTS
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
 from mujoban_msgs_py.topics import TICK, Topic
@@ -107,6 +105,7 @@ class LiveNode(GraphNode):
         self._latest = _Received(-1, 0.0)
         self._torque = _Received(-1, 0.0)
         self._shown = Shown(None, None, {})
+        self._log_told()
         self._agent = (0.0, 0.0)
         self._has_named_torques = False
         handlers: dict[Topic, Callable[[int, Any], None]] = {
@@ -185,12 +184,15 @@ class LiveNode(GraphNode):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         """Note which module each node runs."""
-        for status in message.status:
-            said = {value.key: value.value for value in status.values}
-            role = status.name.rpartition("/")[2]
-            if role in (*ROLES, ALONE) and MODULE in said:
-                who = played(said[MODULE], said.get(WEIGHTS, ""))
-                self._shown = self._shown._replace(modules={**self._shown.modules, role: who})
+        modules = players(message, self._shown.modules)
+        if modules != self._shown.modules:
+            self._shown = self._shown._replace(modules=modules)
+            self._log_told()
+
+    def _log_told(self) -> None:
+        """Log who is told the ground truth, for every moment of a recording: also for those before it was heard."""
+        shown = rr.TextDocument(told(self._shown.modules), media_type=rr.MediaType.MARKDOWN)
+        self._stream.log("told", shown, static=True)
 
     def _log_text(self) -> None:
         self._stream.log("now", rr.TextDocument(text(self._shown), media_type=rr.MediaType.MARKDOWN))

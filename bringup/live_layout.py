@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from bringup.overlay import COLOURS
 from bringup.view import ARROWS
 from mujoban_core.grid import CONTROL_PERIOD, GRID_SIZE, OFFSETS_RC
 from mujoban_core.grid import Instruction as Direction
-from mujoban_core.plugins import AGENT, PRIVILEGED, ROLES, is_privileged
+from mujoban_core.plugins import AGENT, ROLES, TOLD, is_privileged, privileged_roles
 
 CELL: Final = 16
 """Pixels along the edge of a cell of a map."""
@@ -54,12 +53,6 @@ class Shown(NamedTuple):
     """Role -> what plays it."""
 
 
-def played(module: str, weights: str) -> str:
-    """Return what plays a role by what its node says of module and weights, so that `is_privileged` tells it."""
-    name, mark, _ = module.partition(PRIVILEGED)
-    return " ".join(filter(None, (name, Path(weights).name))) + mark
-
-
 def text(shown: Shown) -> str:
     """Return the text, Markdown: the instruction with its arrow, the episode, and who plays."""
     heading, rows = "waiting for the graph", []
@@ -77,12 +70,30 @@ def text(shown: Shown) -> str:
             ("on target", f"{episode.boxes_on_target} of {boxes} boxes{', solved' if episode.solved else ''}"),
             ("return", f"{episode.episode_return:+.0f}"),
         ]
-    for role in (AGENT,) if AGENT in shown.modules else ROLES:
+    for role in _roles(shown.modules):
         who = shown.modules.get(role, "not heard yet")
         rows.append((role, f"**{who}**" if is_privileged(who) else who))
     head, *others = rows
     table = [f"| {head[0]} | {head[1]} |", "|---|---|", *(f"| {name} | {value} |" for name, value in others)]
     return "\n".join([f"# {heading}", *table])
+
+
+def told(modules: Mapping[str, str]) -> str:
+    """Return who is told the ground truth, Markdown: it holds for a whole run, whatever moment of it is looked at.
+
+    Args:
+        modules: Role -> what plays it, of the roles that were heard of.
+    """
+    roles = privileged_roles(modules)
+    unheard = [role for role in _roles(modules) if role not in modules]
+    lines = [f"**{TOLD}: {', '.join(roles)}**"] if roles else []
+    lines += [f"not heard yet: {', '.join(unheard)}"] if unheard else []
+    return "\n\n".join(lines) or "nobody"
+
+
+def _roles(modules: Mapping[str, str]) -> Sequence[str]:
+    """Return the roles that are played: an agent's, where one was heard of, or those of the four modules."""
+    return (AGENT,) if AGENT in modules else tuple(ROLES)
 
 
 def describe(stream: rr.RecordingStream) -> None:
@@ -163,6 +174,11 @@ def blueprint() -> rrb.Blueprint:
         rrb.TimeSeriesView(origin="reward", name="reward", plot_legend=corner),
         rrb.TimeSeriesView(origin="milliseconds", name="ms a tick, by node", time_ranges=recent, plot_legend=corner),
     ]  # fmt: skip
+    texts = rrb.Vertical(
+        rrb.TextDocumentView(origin="now", name="now"),
+        rrb.TextDocumentView(origin="told", name="who is told the ground truth"),
+        row_shares=[4.0, 1.0],
+    )
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
@@ -170,9 +186,7 @@ def blueprint() -> rrb.Blueprint:
                 rrb.Spatial2DView(origin="camera/top_down", name="from above (unseen)"),
                 *maps,
             ),
-            rrb.Horizontal(
-                rrb.TextDocumentView(origin="now", name="now"), *curves, column_shares=[1.1, 1.0, 1.0, 1.0, 1.0]
-            ),
+            rrb.Horizontal(texts, *curves, column_shares=[1.1, 1.0, 1.0, 1.0, 1.0]),
         ),
         collapse_panels=True,
     )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from mujoban_core.files import brief
 from mujoban_core.text import readable
 
 _WIDTH: Final = 112
@@ -17,8 +18,6 @@ _SPENT: Final = ("steps", "updates", "samples", "env_steps", "seconds")
 _ORIGINS: Final = ("init", "initial", "start", "teacher", "critic", "bags_digest")
 """Digests, in a record, of what weights began with and learned from."""
 _STALE: Final = "†"
-_DIGITS: Final = 16
-"""Of a digest, enough to tell files apart."""
 _NAMED_TEACHERS: Final = ("scripted driver",)
 """What a record's `teacher` may be beside a digest."""
 
@@ -233,7 +232,7 @@ def _weights(record: Mapping[str, Any], weights: str) -> list[tuple[str, str]]:
         ("file", f"`{weights}`"),
         ("class", f"`{record['class']}`"),
         ("parameters", f"{record['parameters']:,}"),
-        ("digest", f"`{record['digest'][:_DIGITS]}`"),
+        ("digest", f"`{brief(record['digest'])}`"),
         ("license", "Apache-2.0"),
     ]
 
@@ -264,7 +263,7 @@ def _training(record: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _told(origin: str | Mapping[str, str]) -> str:
     """Return the digest of an origin, or those of several by name, as a cell."""
     if isinstance(origin, str):
-        return f"`{origin if origin in _NAMED_TEACHERS else origin[:_DIGITS]}`"
+        return f"`{origin if origin in _NAMED_TEACHERS else brief(origin)}`"
     return ", ".join(f"{name} {_told(digest)}" for name, digest in origin.items())
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, OFFSETS_RC, TARGET, WALL, Instruction
+from mujoban_core.plugins import TOLD
 
 CELL: Final = 10
 """Pixels along the edge of a cell of the small map."""
@@ -101,7 +102,7 @@ def name_told(picture: NDArray[np.uint8], told: Sequence[str]) -> NDArray[np.uin
     brush = ImageDraw.Draw(image)
     top = image.height - BAR
     brush.rectangle((0, top, image.width, image.height), fill=(0, 0, 0))
-    text = f"privileged, told the ground truth:\n{', '.join(told)}"
+    text = f"{TOLD}:\n{', '.join(told)}"
     font = ImageFont.load_default(_SMALL)
     brush.text((4, top + BAR / 2), text, fill=_YELLOW, anchor="lm", font=font, spacing=1)
     return np.asarray(image)

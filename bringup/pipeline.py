@@ -25,7 +25,7 @@ from typing import Any
 
 from mujoban_core import children
 from mujoban_core.commit import commit_of
-from mujoban_core.files import alone, digest, write_atomically
+from mujoban_core.files import alone, brief, digest, write_atomically
 from mujoban_core.signals import StopSignal
 
 _PERIOD = 0.2
@@ -225,8 +225,8 @@ class Pipeline:
                 expected = made.outputs.get(_name(path, self.directory))
                 if expected is not None and (found := digest(path)) != expected:
                     raise PipelineError(
-                        f"{path}: was changed since stage {stage.name} made it: SHA-256 is {found[:16]}, expected "
-                        f"{expected[:16]}; or remove it, and it is made again"
+                        f"{path}: was changed since stage {stage.name} made it: SHA-256 is {brief(found)}, "
+                        f"expected {brief(expected)}; or remove it, and it is made again"
                     )
 
     def _start_ready(self) -> None:

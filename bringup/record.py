@@ -30,6 +30,7 @@ from bringup.command import Stack, import_from_here, recorded_seeds
 from bringup.exploration import Disturbance, disturbed
 from bringup.options import ClusterOptions, Count, ModuleOptions, WorldOptions, one_of, whole
 from bringup.progress import EpisodesBar
+from bringup.results import told, told_roles
 from bringup.rollout import ticks
 from mujoban_core import children
 from mujoban_core.bodies import get_body
@@ -194,7 +195,10 @@ def record(job: Job, on_end: Callable[[int], None] = lambda _: None) -> int:
         threads=job.stack.threads,
     )  # fmt: skip
     difficulties = [job.episodes.difficulty(i) for i in range(len(job.episodes))]
-    recorder = Recorder(job.out, world.body, job.episodes, difficulties, prefix=job.prefix, world=job.world)
+    recorder = Recorder(
+        job.out, world.body, job.episodes, difficulties, prefix=job.prefix, world=job.world,
+        privileged=told_roles(job.stack.identities()),
+    )  # fmt: skip
     with StopSignal(deferred=False) as stop:
         try:
             for tick in ticks(policy, world, job.episodes, camera=True, run_seed=job.run_seed):
@@ -309,6 +313,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
     check_folder("--out", options.out, may_exist=True)
     seeds = recorded_seeds(options.seed, allow_test_seeds=options.allow_test_seeds)
     jobs = [_job(options, seeds.start, part) for part in range(options.parts)]
+    who = told(jobs[0].stack.identities())
     options.out.mkdir(parents=True, exist_ok=True)
     recorded = 0
     with EpisodesBar(options.episodes) as bar:
@@ -320,7 +325,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
 
         on_end(0)
         total = _record_all(jobs, options.shared.cluster, on_end)
-    print(f"{total} ticks of {options.episodes} episodes in {len(list(options.out.iterdir()))} bags")
+    print(f"{total} ticks of {options.episodes} episodes in {len(list(options.out.iterdir()))} bags", *who, sep="\n")
     return 0
 
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Self
 
-from mujoban_core.plugins import PRIVILEGED, privileged_roles
+from mujoban_core.plugins import PRIVILEGED, TOLD, privileged_roles
 from mujoban_core.stats import wilson_interval
 
 
@@ -114,10 +114,23 @@ def summary(content: Mapping[str, Any]) -> list[str]:
         seeds = [str(entry["seed"]) for entry in episodes if entry["failure"] == cause]
         more = f" and {count - SEEDS_SHOWN} more" if count > SEEDS_SHOWN else ""
         lines.append(f"lost by {cause}: {count} (seeds {', '.join(seeds[:SEEDS_SHOWN])}{more})")
-    if content["privileged"]:
-        told = ", ".join(f"{role}: {_brief(content['weights'][role])}" for role in content["privileged"])
-        lines.append(f"privileged, told the ground truth: {told}")
+    lines += told(content["weights"])
     return lines + [f"{event}: {count}" for event, count in sorted(content.get("counts", {}).items())]
+
+
+def told(weights: Mapping[str, str]) -> list[str]:
+    """Return a line that names who is told the ground truth, and what that is; none where nobody is.
+
+    Args:
+        weights: Name of each module -> what identifies it, see `report`.
+    """
+    named = [f"{role}: {_brief(weights[role])}" for role in privileged_roles(weights)]
+    return [f"{TOLD}: {', '.join(named)}"] if named else []
+
+
+def told_roles(weights: Mapping[str, str]) -> str:
+    """Return the roles that are told the ground truth, as bags name them; `none` where there is none."""
+    return ", ".join(privileged_roles(weights)) or "none"
 
 
 def _brief(identity: str) -> str:

@@ -58,6 +58,7 @@ class Recorder:
         *,
         prefix: str = "",
         world: str = DEFAULT_WORLD,
+        privileged: str = "",
         episodes_per_file: int | None = 16,
     ) -> None:
         """Record into a folder.
@@ -69,11 +70,13 @@ class Recorder:
             difficulties: Difficulty of each, 0 for levels from a file.
             prefix: Start of the bags' names, to tell recorders that share a folder apart.
             world: The physical world, which the bags name.
+            privileged: Roles that are told the ground truth, which the bags name, or `none`; empty: they do not.
             episodes_per_file: Episodes in one file of a bag; None: all.
         """
         self._path, self._prefix, self._episodes_per_file = path, prefix, episodes_per_file
         self._episodes, self._difficulties = episodes, difficulties
-        self._body, self._world = body, world
+        self._body = body
+        self._about = {"body": body.name, "world": world} | ({"privileged": privileged} if privileged else {})
         self._rows: dict[int, _Row] = {}
         self.ticks = 0
         """Ticks written."""
@@ -110,7 +113,7 @@ class Recorder:
                 room = str(tick.truth.box_position.shape[1])
                 writer = BagWriter(
                     path, TOPICS, episodes_per_file=self._episodes_per_file, flush_after=FLUSH_AFTER,
-                    about={"body": self._body.name, "world": self._world, "max_boxes": room},
+                    about={**self._about, "max_boxes": room},
                 )  # fmt: skip
                 self._rows[number] = _Row(writer, TickComposer(self._body))
             self._write_row(self._rows[number], tick, m)

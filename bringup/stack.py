@@ -21,7 +21,7 @@ from bringup.graph import RESPAWN_PERIOD, GraphError, InProcess, Processes
 from bringup.graph_recorder import RecorderNode
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
-from bringup.results import EpisodeResult
+from bringup.results import EpisodeResult, told_roles
 from bringup.video import EDGE, VideoNode
 from mujoban_core import children
 from mujoban_core.bodies import get_body
@@ -138,8 +138,7 @@ def play(
         stop.deferred = True  # from here on there are files to finish
         listeners: list[RecorderNode | VideoNode] = []
         if options.record is not None:
-            recorder = _recorder(options.record, options, stack.body, episodes.max_boxes, instructed=not alone)
-            listeners.append(graph.add(recorder))
+            listeners.append(graph.add(_recorder(options.record, options, stack, episodes.max_boxes)))
         if options.video is not None:
             video = VideoNode(
                 options.video,
@@ -220,9 +219,10 @@ def viewer(address: str, run: int = ANY) -> Iterator[None]:
         children.stop([process])
 
 
-def _recorder(path: Path, options: PlayOptions, body: str, max_boxes: int, *, instructed: bool) -> RecorderNode:
+def _recorder(path: Path, options: PlayOptions, stack: Player, max_boxes: int) -> RecorderNode:
     values = {
-        "path": str(path), "episodes_per_file": options.episodes_per_file, "body": body, "world": options.world,
-        "max_boxes": max_boxes, "instructed": instructed, "run": options.run,
+        "path": str(path), "episodes_per_file": options.episodes_per_file, "body": stack.body, "world": options.world,
+        "privileged": told_roles(stack.identities()), "max_boxes": max_boxes, "instructed": not isinstance(stack, Solo),
+        "run": options.run,
     }  # fmt: skip
     return RecorderNode(parameter_overrides=[Parameter(name, value=value) for name, value in values.items()])

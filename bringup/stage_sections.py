@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +12,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 from mujoban_core.text import readable
-from mujoban_rl.metrics import COUNT, METRICS, read_metrics
+from mujoban_rl.metrics import COUNT
 
 _LEARNING: Final = (
     "loss/", "train/", "mpo/loss", "mpo/policy_loss", "mpo/q", "play/", "search/", "instruction/", "return",
@@ -24,17 +24,22 @@ _COLUMNS: Final = 4
 """Panels side by side."""
 
 
-def sections(run: Path, names: dict[str, str]) -> Iterator[str]:
+Measured = Mapping[str, list[dict[str, Any]]]
+"""The lines of the metrics of each stage that has any, by the stage's name."""
+
+
+def sections(run: Path, names: Mapping[str, str], measured: Measured) -> Iterator[str]:
     """Yield the lines of a section, folded up, for each stage that has measured something; draw `curves/STAGE.png`.
 
     Args:
         run: Directory of the run, with those of its stages.
         names: Titles of the stages, by name.
+        measured: By the stages.
     """
     for name, title in names.items():
-        if not (run / name / METRICS).exists():
+        if name not in measured:
             continue
-        lines = read_metrics(run / name)
+        lines = measured[name]
         yield from ("", f"<details><summary>{title}</summary>", "")
         picture = Path("curves") / f"{name}.png"
         if draw_learning(lines, title, run / picture):

@@ -10,8 +10,8 @@ from typing import Annotated, Final, Literal
 
 import tyro
 
+from bringup.finished_run import body_of, seed_of
 from bringup.options import Count, WorldOptions, whole
-from bringup.training_seed import seed_of
 from bringup.training_sizes import Machine
 from mujoban_core.bodies import get_body
 from mujoban_planner.seed_streams import LAST_SEED
@@ -58,13 +58,17 @@ class Options:
     """Validation levels that each table of the report counts."""
 
     def __post_init__(self) -> None:
-        """Reject times in which nothing can be learned, and seeds past those for training."""
+        """Reject times in which nothing can be learned, seeds past those for training, and unfit runs to go on from."""
         if not 0 < self.hours < math.inf:
             raise ValueError(f"--hours {self.hours}: expected a positive number")
         if not 0 <= self.stream <= LAST_SEED:
             raise ValueError(f"--seed {self.stream}: expected a whole number from 0 to {LAST_SEED}")
         if self.keep and self.before is None:
             raise ValueError(f"--keep {' '.join(self.keep)}: expected --continue, which says whose are kept")
+        body = None if self.before is None else body_of(self.before)
+        if body not in (None, self.physics.body):
+            told = f"--body {self.physics.body}: --continue {self.before}"
+            raise ValueError(f"{told} is a run of the {body}, expected it")
         spared = BAGS if self.has_critic else (*BAGS, "critic")
         needed = (path for name, path in PRODUCTS.items() if name not in spared)
         missing = [] if self.before is None else [path for path in needed if not (self.before / path).exists()]

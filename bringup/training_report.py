@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -17,8 +17,8 @@ from matplotlib import pyplot as plt
 from bringup import keep
 from bringup.model_card import Place, Score, card
 from bringup.pipeline import Entry, Pipeline, Stage
-from bringup.stage_sections import sections
-from mujoban_core.files import write_atomically
+from bringup.stage_sections import Measured, sections
+from mujoban_core.files import brief, write_atomically
 from mujoban_core.text import readable
 from mujoban_planner.deliberation import LOOK_AHEAD
 from mujoban_rl.metrics import METRICS, read_metrics
@@ -68,35 +68,31 @@ def write_report(run: Path, pipeline: Pipeline, weights: Mapping[str, str]) -> P
         text = card(target, f"weights/{role}.safetensors", _PLACE, scores)
         write_atomically(target.with_suffix(".md"), text.encode())
     titles = {stage.name: _title(stage.name, pipeline) for stage in pipeline.stages}
-    figure = draw_curves(run, titles, run / "curves.png")
-    lines = [*_summary(run, evaluations, pipeline), *_stages(run, pipeline), *_origins(pipeline)]
+    measured = _measured(run, titles)
+    figure = draw_curves(measured, titles, run / "curves.png")
+    lines = [*_summary(run, evaluations, pipeline, measured), *_stages(run, pipeline), *_origins(pipeline)]
     if figure:
         lines += ["", "![Validation scores against CPU seconds](curves.png)"]
-    lines += ["", "## Metrics and curves of each stage", *sections(run, titles)]
+    lines += ["", "## Metrics and curves of each stage", *sections(run, titles, measured)]
     path = run / "report.md"
     write_atomically(path, ("\n".join(lines) + "\n").encode())
     return path
 
 
-def read_curves(run: Path) -> dict[str, list[tuple[float, float]]]:
-    """Return the curves of a training's `metrics.jsonl`: pairs of CPU seconds and score, by the score's name."""
-    curves: dict[str, list[tuple[float, float]]] = {}
-    for values in read_metrics(run):
-        for name, value in values.items():
-            if name.startswith(_PREFIX) and value is not None:
-                curves.setdefault(name.removeprefix(_PREFIX), []).append((values["cpu_seconds"], value))
-    return curves
+def _measured(run: Path, stages: Iterable[str]) -> Measured:
+    """Return what those of some stages have measured that measure anything."""
+    return {name: read_metrics(run / name) for name in stages if (run / name / METRICS).exists()}
 
 
-def draw_curves(run: Path, titles: Mapping[str, str], path: Path) -> bool:
+def draw_curves(measured: Measured, titles: Mapping[str, str], path: Path) -> bool:
     """Draw the validation curves of all trainings, one panel each; return whether there are any.
 
     Args:
-        run: Directory of the run.
+        measured: By the trainings.
         titles: Of the panels, by the names of the stages.
         path: The picture.
     """
-    found = {title: curves for name, title in titles.items() if (curves := _rates(run / name))}
+    found = {title: curves for name, title in titles.items() if (curves := _rates(measured.get(name, [])))}
     if not found:
         return False
     columns = min(len(found), _COLUMNS)
@@ -117,11 +113,15 @@ def draw_curves(run: Path, titles: Mapping[str, str], path: Path) -> bool:
     return True
 
 
-def _rates(run: Path) -> dict[str, list[tuple[float, float]]]:
-    """Return the curves that are drawn."""
-    if not (run / METRICS).exists():
-        return {}
-    return {name: points for name, points in read_curves(run).items() if name.startswith(_RATES)}
+def _rates(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[tuple[float, float]]]:
+    """Return the curves of a training that are drawn: pairs of CPU seconds and score, by the score's name."""
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for line in lines:
+        for metric, value in line.items():
+            name = metric.removeprefix(_PREFIX)
+            if metric != name and name.startswith(_RATES) and value is not None:
+                curves.setdefault(name, []).append((line["cpu_seconds"], value))
+    return curves
 
 
 def cost(run: Path) -> dict[str, float]:
@@ -130,23 +130,28 @@ def cost(run: Path) -> dict[str, float]:
     Raises:
         PipelineError: If its record is damaged.
     """
-    return _cost(run, Pipeline.read(run))
+    pipeline = Pipeline.read(run)
+    return _cost(run, pipeline, _measured(run, filter(_acts, pipeline.entries)))
 
 
-def _cost(run: Path, pipeline: Pipeline) -> dict[str, float]:
+def _cost(run: Path, pipeline: Pipeline, measured: Measured) -> dict[str, float]:
     spent = sum(entry.cpu_seconds for entry in pipeline.entries.values())
-    return {"step": _steps(run), "cpu_seconds": round(spent), "seconds": round(pipeline.seconds())}
+    return {"step": _steps(run, pipeline, measured), "cpu_seconds": round(spent), "seconds": round(pipeline.seconds())}
 
 
-def _steps(run: Path) -> int:
+def _steps(run: Path, pipeline: Pipeline, measured: Measured) -> int:
     """Return the environment steps of the controller's trainings and of what was recorded."""
     logs = (run / "logs").glob("bags_*.txt")
     recorded = sum(int(ticks) for log in logs for ticks in _RECORDED.findall(log.read_text()))
     # What was kept of another run was taken there.
-    trained = (name for name, entry in Pipeline.read(run).entries.items() if not _is_kept(entry))
-    acted = (run / name for name in trained if name.startswith(_ACTING))
-    lines = (read_metrics(stage) for stage in acted if (stage / METRICS).exists())
+    acted = (name for name, entry in pipeline.entries.items() if _acts(name) and not _is_kept(entry))
+    lines = (measured.get(name, []) for name in acted)
     return recorded + sum(stage[-1]["step"] for stage in lines if stage)
+
+
+def _acts(name: str) -> bool:
+    """Return whether a stage's samples are steps in the environment."""
+    return name.startswith(_ACTING)
 
 
 def _is_kept(entry: Entry) -> bool:
@@ -164,8 +169,10 @@ def _score(name: str, report: Mapping[str, Any]) -> Score:
     return Score(EVALUATIONS[name].title, "none", levels, report["success_rate"], report["success_interval"])
 
 
-def _summary(run: Path, evaluations: Mapping[str, Mapping[str, Any]], pipeline: Pipeline) -> Iterator[str]:
-    spent = _cost(run, pipeline)
+def _summary(
+    run: Path, evaluations: Mapping[str, Mapping[str, Any]], pipeline: Pipeline, measured: Measured
+) -> Iterator[str]:
+    spent = _cost(run, pipeline, measured)
     yield "# Weights from nothing"
     yield ""
     yield (
@@ -241,4 +248,4 @@ def _origins(pipeline: Pipeline) -> Iterator[str]:
             yield f"  - by commit {told['commit'] or 'unknown'}, torch {told['torch']}, {cores}"
         for direction, digests in (("from", entry.inputs), ("made", entry.outputs)):
             for name, digest in digests.items():
-                yield f"  - {direction} `{name}`, SHA-256 {digest[:16]}"
+                yield f"  - {direction} `{name}`, SHA-256 {brief(digest)}"

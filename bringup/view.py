@@ -19,7 +19,7 @@ from rich.text import Text
 from bringup.monitor import MonitorNode, Watched
 from bringup.results import EpisodeResult
 from mujoban_core.grid import AGENT, BOX, CONTROL_PERIOD, TARGET, WALL, Instruction
-from mujoban_core.plugins import privileged_roles
+from mujoban_core.plugins import TOLD, privileged_roles
 from mujoban_msgs_py.conversions import EpisodeTruthReading, InstructionReading
 
 ARROWS = {
@@ -99,7 +99,7 @@ def live_view(
         states = {"estimate": tick.estimate, **states}
     maps = [Panel(grid_text(state), title=name, height=12, width=24) for name, state in states.items()]
     told = privileged_roles(weights or {})
-    last = Text(f"privileged, told the ground truth: {', '.join(told)}" if told else "", "yellow")
+    last = Text(f"{TOLD}: {', '.join(told)}" if told else "", "yellow")
     if width < WIDE:
         pairs = [Text.assemble((f"{name} ", "bright_black"), value) for name, value in facts.items()]
         return Group(decided, Columns(pairs), Columns(maps), last)

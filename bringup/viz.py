@@ -17,6 +17,7 @@ from importlib.util import find_spec
 from typing import Final, Unpack
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, Pose, Vector3
 from mujoban_msgs.msg import AbstractState
 from nav_msgs.msg import MapMetaData, OccupancyGrid
@@ -27,12 +28,15 @@ from std_msgs.msg import ColorRGBA, Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from bringup.frames import camera_transforms, robot_description, robot_transform
+from bringup.players import players
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.grid import CHANNELS, TARGET, WALL, cell_to_xy
+from mujoban_core.plugins import TOLD, privileged_roles
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.decoders import checked
 from mujoban_msgs_py.listening import Received, listen
+from mujoban_msgs_py.runtime import diagnostics
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, declare, described
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.tick_node import live_qos, run_node
@@ -51,11 +55,16 @@ _COLOURS: Final = {
     "target": (0.8, 0.1, 0.1, 1.0),
     "box": (0.8, 0.75, 0.1, 1.0),
     "robot": (0.2, 0.4, 0.9, 1.0),
+    "told": (0.94, 0.86, 0.24, 1.0),
 }
+_TEXT_HEIGHT: Final = 0.4
+"""Of a letter, in cells: all four roles side by side are then hardly as wide as the grid."""
 
 
 class VizNode(GraphNode):
     """Publishes the four layers of the estimate as occupancy grids and the true scene as markers.
+
+    The scene names who is told the ground truth, above the grid.
 
     Topics: `/viz/estimate/<layer>` and `/viz/ground_truth/<layer>` (nav_msgs/OccupancyGrid, percent, frame `map`) for
     the layers wall, target, agent and box; `/viz/scene` (visualization_msgs/MarkerArray); `/robot_description` (URDF);
@@ -80,6 +89,7 @@ class VizNode(GraphNode):
         self._posed = -1
         """Stamp of the latest pose [ns]."""
         self._boxes: list[Pose] = []
+        self._modules: dict[str, str] = {}
         self._grids = {
             (source, name): self.create_publisher(OccupancyGrid, f"{PREFIX}/{source}/{name}", 1)
             for source in ("estimate", "ground_truth")
@@ -94,6 +104,7 @@ class VizNode(GraphNode):
             (topics.TRUE_BOXES, self._on_boxes),
         ):
             listen(self, topic, show, qos=live_qos(), decode=checked(topic))
+        self.create_subscription(DiagnosticArray, diagnostics.TOPIC, self._on_diagnostics, 10)
 
     def _describe(self) -> None:
         """Publish what stays as it is, for those who join at any time."""
@@ -117,6 +128,9 @@ class VizNode(GraphNode):
         if self._tf is not None and message.stamp != before:
             transform = robot_transform(message.content.header.stamp, message.content.pose)
             self._tf.publish(self._make_tf(transforms=[transform]))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self._modules = players(message, self._modules)
 
     def _on_boxes(self, message: Received) -> None:
         self._boxes = list(message.content.poses)
@@ -153,7 +167,17 @@ class VizNode(GraphNode):
         if self._pose is not None:
             length, breadth, thickness = (part * cell for part in _ARROW)
             markers.append(_marker(header, "robot", Marker.ARROW, (length, breadth, thickness), self._pose))
-        return markers
+        return [*markers, self._told(header, state.shape[0])]
+
+    def _told(self, header: Header, rows: int) -> Marker:
+        """Return who is told the ground truth, north of a grid of so many rows; where nobody is, nothing is left."""
+        cell, told = self._body.cell_size, privileged_roles(self._modules)
+        place = _pose(0.0, (rows / 2 + 3 * _TEXT_HEIGHT) * cell, 0.0)
+        marker = _marker(header, "told", Marker.TEXT_VIEW_FACING, (0.0, 0.0, _TEXT_HEIGHT * cell), place)
+        marker.text = f"{TOLD}:\n{', '.join(told)}"
+        if not told:
+            marker.action = Marker.DELETE
+        return marker
 
 
 def map_header(header: Header) -> Header:

@@ -56,10 +56,12 @@ def main(command_line: Sequence[str] | None = None) -> int:
     """Play and print both reports."""
     options = read_options(Options, command_line, PROG, __doc__)
     levels = Episodes(options.episodes, VALIDATION_SEEDS.start, difficulty=1)
-    oracles = Stack({role: Choice(role, "oracle") for role in ROLES}).policy()
+    stack = Stack({role: Choice(role, "oracle") for role in ROLES})
+    oracles = stack.policy()
     for name, policy in {"oracle": oracles, "random": replace(oracles, planner=RandomPlanner())}.items():
         results = evaluate(policy, levels, time_limit=1200)
-        print(f"{name} planner", *summary(report(results, {"planner": name})), sep="\n  ")
+        weights = {**stack.identities(), "planner": name}
+        print(f"{name} planner", *summary(report(results, weights)), sep="\n  ")
     return 0
 
 

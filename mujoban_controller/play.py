@@ -90,7 +90,7 @@ class PrivilegedPlayer(TaskPlayer):
         By `explore` at least; those of a share of the robots, which is `steady`, do not deviate.
         """
         self.task, self._generator, self._explore = task, generator, explore
-        self._steady = steady_rows(task.world.batch, steady)[:, None]
+        self._steady = steady
         self._policy = PrivilegedPolicy(**policy.config)
         self._features: NDArray[np.float32] = task.features()
 
@@ -99,7 +99,7 @@ class PrivilegedPlayer(TaskPlayer):
         """Play one tick."""
         features = self._features
         drawn = self._policy(torch.from_numpy(features))
-        scale = drawn.scale.masked_fill(self._steady, 0.0)
+        scale = steadied(drawn.scale, self._steady)
         action = drawn_torque(drawn.mean, scale, self._explore, self._generator)
         result = self.task.step(action)
         self._features = self.task.features()
@@ -185,20 +185,19 @@ class ExploringPlayer(CameraPlayer):
         A share of the robots is `steady`: theirs do not deviate.
         """
         super().__init__(task, policy, generator)
-        self._explore = explore
-        self._steady = steady_rows(task.world.batch, steady)[:, None]
+        self._explore, self._steady = explore, steady
 
     def _act(self, inputs: ControllerInput, mean: Tensor, scale: Tensor) -> tuple[NDArray[np.float32], Fields]:
-        scale = scale.masked_fill(self._steady, 0.0)
+        scale = steadied(scale, self._steady)
         torque = drawn_torque(mean, scale, self._explore, self.generator)
         seen = {"features": self.task.features(), "action": torque}
         return torque, {**seen, "mean": mean.numpy(), "scale": scale.numpy()}
 
 
-def steady_rows(batch: int, share: float) -> Tensor:
-    """Return which of so many robots play by the mean of their policy, bool [B]: about that share of them."""
-    count = torch.arange(batch + 1, dtype=torch.float64) * share
-    return count.floor().diff() > 0.0
+def steadied(scale: Tensor, share: float) -> Tensor:
+    """Return scales, [B, U], that are 0 for about that share of the robots: they play by the mean of their policy."""
+    count = torch.arange(len(scale) + 1, dtype=torch.float64) * share
+    return scale.masked_fill((count.floor().diff() > 0.0)[:, None], 0.0)
 
 
 def drawn_torque(

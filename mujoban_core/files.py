@@ -15,6 +15,7 @@ _DEVICES = (Path("/dev"), Path("/proc"))
 
 
 _UNFINISHED = ".unfinished"
+_DIGITS = 16
 LOCK = "lock"
 """Name of the file in a folder by which a process keeps others out."""
 
@@ -108,6 +109,11 @@ def digest(path: str | Path) -> str:
         with file.open("rb") as stream:
             hashlib.file_digest(stream, lambda: total)
     return total.hexdigest()
+
+
+def brief(sha256: str) -> str:
+    """Return the beginning of a digest, enough to tell files apart, for texts that people read."""
+    return sha256[:_DIGITS]
 
 
 @contextmanager

@@ -24,6 +24,8 @@ ORACLE: Final = "oracle"
 
 PRIVILEGED: Final = " (privileged)"
 """Ends the name of what receives the ground truth, other than an oracle."""
+TOLD: Final = "privileged, told the ground truth"
+"""What reports and views say of the roles that `privileged_roles` returns."""
 
 GROUP: Final = "mujoban.modules"
 """The entry points' group."""

@@ -28,6 +28,7 @@ from benchmarks.paper.runs import (
     SEED,
 )
 from mujoban_core.bodies import ANT, BALL
+from mujoban_core.plugins import TOLD, privileged_roles
 from mujoban_core.program import read_options, run_command
 from mujoban_sim.presets import DEFAULT_WORLD
 from mujoban_sim.rendering import RenderingError
@@ -194,11 +195,13 @@ def _film_strip(body: str, what: str, file: Path) -> list[str]:
     except RenderingError as error:
         print(f"{what} stays as it was: {error}", file=sys.stderr)
     stale = tables.STALE if film.is_stale(recorded, episode) else ""
+    told = privileged_roles(episode["weights"])
+    named = f" {TOLD.capitalize()}: {', '.join(told)}." if told else ""
     text = (
         "Top row: what the robot sees. Bottom row: the view from above, which it does not see. Seed "
         f"{episode['seed']}, difficulty {episode['difficulty']}, solved in {len(episode['torque'])} steps with "
         f"{len(episode['instructions'])} instructions. The arrow is the instruction in force, up being north in the "
-        f"bottom row; a dot is STAY, as while it looks around.{stale}\n"
+        f"bottom row; a dot is STAY, as while it looks around.{named}{stale}\n"
     )
     return [text, f"![Frames of an episode that was solved]({file.name})\n"]
 

@@ -33,16 +33,23 @@ def configurations(runs: Sequence[Run]) -> str:
 
 
 def failures(runs: Sequence[Run]) -> str:
-    """Return a table of how many episodes failed for which reason, and a line that says what the reasons mean."""
+    """Return a table of how many episodes failed for which reason, and a line that says what the reasons mean.
+
+    Like every table it names who was told the ground truth.
+    """
     reports = [load(run) for run in runs]
     reasons = sorted({reason for report in reports if report for reason in report["failures"]})
     rows = [
-        [run.title + _mark(run, report), *(str(report["failures"].get(reason, 0)) for reason in reasons)]
+        [
+            run.title + _mark(run, report),
+            privileged(run, report),
+            *(str(report["failures"].get(reason, 0)) for reason in reasons),
+        ]
         for run, report in zip(runs, reports, strict=True)
         if report
     ]
     meant = "; ".join(f"*{reason}*, {Failure(reason).meaning}" for reason in reasons)
-    return _table(["configuration", *reasons], rows) + (f"\nCauses: {meant}.\n" if meant else "")
+    return _table(["configuration", "oracles", *reasons], rows) + (f"\nCauses: {meant}.\n" if meant else "")
 
 
 def fine_tuned() -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from mujoban_controller.controller import Recurrent, VisuomotorController
-from mujoban_controller.play import drawn_torque, steady_rows
+from mujoban_controller.play import drawn_torque, steadied
 from mujoban_core.interfaces import Controller, ControllerInput, Memory, Planner
 from mujoban_planner.planner import LearnedPlanner, check_abstract_state
 
@@ -58,6 +58,5 @@ class DrawingController(Controller):
     def step(self, inputs: ControllerInput, state: Memory) -> tuple[NDArray[np.float32], Memory]:
         """Return torques limited to [-1, 1], [B, U], and the next memory."""
         output = self.network(*self.network.to_tensors(inputs), memory=Recurrent(*state))
-        mean, scale = output.action.mean[:, 0], output.action.scale[:, 0]
-        scale = scale.masked_fill(steady_rows(len(scale), self._steady)[:, None], 0.0)
+        mean, scale = output.action.mean[:, 0], steadied(output.action.scale[:, 0], self._steady)
         return drawn_torque(mean, scale, self._explore, self._generator), output.memory

@@ -1,4 +1,4 @@
-"""What a node says of itself on /diagnostics, once a second (REP 107)."""
+"""What a node says of itself on /diagnostics: at once to who begins to listen, then once a second (REP 107)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
+from rclpy.event_handler import PublisherEventCallbacks
+
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 
 TOPIC: Final = "/diagnostics"
 PERIOD: Final = 1.0
@@ -27,12 +29,14 @@ class Condition(NamedTuple):
     warning: bool = False
 
 
-def report_on(node: Node, look: Callable[[], Condition]) -> None:
-    """Have a node publish, every `PERIOD` in which somebody listens, the condition that `look` returns."""
-    publisher = node.create_publisher(DiagnosticArray, TOPIC, 10)
+def report_on(node: GraphNode, look: Callable[[], Condition]) -> None:
+    """Have a node publish the condition that `look` returns when somebody begins to listen, then every `PERIOD`.
 
-    def publish() -> None:
-        if publisher.get_subscription_count() == 0:
+    A run may be over within the first `PERIOD`, and who watched it, or recorded what he saw, is to know who played.
+    """
+
+    def publish(_: object = None) -> None:
+        if node.ended or publisher.get_subscription_count() == 0:
             return
         condition = look()
         status = DiagnosticStatus(
@@ -45,4 +49,6 @@ def report_on(node: Node, look: Callable[[], Condition]) -> None:
         array.header.stamp = node.get_clock().now().to_msg()
         publisher.publish(array)
 
+    begun = PublisherEventCallbacks(matched=publish)
+    publisher = node.create_publisher(DiagnosticArray, TOPIC, 10, event_callbacks=begun)
     node.create_timer(PERIOD, publish)

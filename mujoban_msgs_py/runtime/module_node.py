@@ -125,9 +125,10 @@ class ModuleNode(TickNode, Generic[ModuleT]):
 
     def _condition(self) -> Condition:
         condition = super()._condition()
-        which = f"{self._source}{PRIVILEGED if self._told else ''}"
-        weights = self.get_parameter("weights").value
-        return condition._replace(values={MODULE: which, WEIGHTS: weights, **condition.values})
+        mark, weights = PRIVILEGED if self._told else "", self.get_parameter("weights").value
+        values = {MODULE: f"{self._source}{mark}", WEIGHTS: weights, **condition.values}
+        # Summaries of all nodes, as Foxglove's, show the line and none of the values.
+        return Condition(f"{condition.message}{mark}", values, condition.warning)
 
     @abstractmethod
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:

@@ -38,7 +38,7 @@ from mujoban_msgs_py.decoders import DECODERS, checked
 from mujoban_msgs_py.listening import belongs, reject, subscribe
 from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions, warn_of_unknown
-from mujoban_msgs_py.runtime.diagnostics import Condition, report_on
+from mujoban_msgs_py.runtime.diagnostics import PERIOD, Condition, report_on
 from mujoban_msgs_py.runtime.discovery import chosen_domain, confine_discovery
 from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.runtime.intra_process import TopicPublisher
@@ -88,7 +88,8 @@ class TickNode(GraphNode):
         self._offers = 0
         self._jumps = Jumps()
         self._answered = 0
-        self._reported = (0, time.monotonic())
+        self._rated = (0, time.monotonic())
+        self._rate = 0.0
 
     @property
     def dropped(self) -> Counter[str]:
@@ -96,15 +97,16 @@ class TickNode(GraphNode):
         return Counter() if self._join is None else self._join.dropped
 
     def _condition(self) -> Condition:
-        (before, since), now = self._reported, time.monotonic()
-        self._reported = (self._answered, now)
+        (before, since), now = self._rated, time.monotonic()
+        if now - since > PERIOD / 2:  # of less, such as until somebody else begins to listen, no rate can be told
+            self._rate, self._rated = (self._answered - before) / (now - since), (self._answered, now)
         values = {
             "ticks answered": self._answered,
-            "ticks/s": f"{(self._answered - before) / (now - since):.1f}",
+            "ticks/s": f"{self._rate:.1f}",
             "dropped messages": self.dropped.total(),
             **self.counts,
         }
-        return Condition("answering" if self._answered > before else "waiting for a tick", values)
+        return Condition("answering" if self._rate else "waiting for a tick", values)
 
     @abstractmethod
     def answer(self, stamp: int, episode: Episode, inputs: dict[str, Any], *, insist: bool) -> Sequence[Output] | None:

@@ -6,12 +6,14 @@ import pytest
 
 from benchmarks import oracles
 from benchmarks.oracles import Options, run
+from mujoban_core.plugins import ROLES
 from mujoban_sokoban.generator import TEST_SEEDS, VALIDATION_SEEDS
 
 
 def test_levels_for_validation_are_played_and_no_use_of_test_levels_is_noted():
     report = run(Options(levels=2, difficulty=1, batch=2, threads=1))
     assert report["n"] == 2 and report["success_rate"] == 1.0 and "test_uses" not in report
+    assert report["privileged"] == list(report["weights"]) == list(ROLES)
 
 
 def test_that_test_levels_were_used_is_noted_before_they_are_played(monkeypatch):

@@ -56,7 +56,9 @@ def test_the_page_has_our_numbers_beside_the_papers_and_marks_other_weights(fold
 def test_a_table_of_failures_says_what_each_of_its_causes_means(folder):
     lost = [EpisodeResult(i, False, 3.0, 100, 9, 0, 0, failure) for i, failure in enumerate(Failure)]
     write_report(report(lost, {}), runs.CONFIGURATIONS[0].file)
+    write(runs.CONFIGURATIONS[1], 3, 4, {"planner": "mine:Cheat (privileged)", "estimator": "oracle"})
     table = tables.failures(runs.CONFIGURATIONS)
+    assert "| default | none | 1 |" in table and "| planner + controller only | planner, estimator | " in table
     assert all(f"*{failure}*, {failure.meaning}" in table for failure in Failure)
     write(runs.CONFIGURATIONS[0], 4, 4, {})
     assert "Causes" not in tables.failures(runs.CONFIGURATIONS)
@@ -79,7 +81,7 @@ def test_a_damaged_source_is_named_with_the_command_that_mends_it(folder):
         results.rebuild(folder)
 
 
-def test_the_film_strip_plays_the_recorded_episode_again(folder):
+def test_the_film_strip_plays_the_recorded_episode_again(folder, monkeypatch):
     kept = film.Film("strip", ORACLES, difficulty=1, seed=1000)
     assert film.load(kept) is None
     film.record(kept)
@@ -88,6 +90,11 @@ def test_the_film_strip_plays_the_recorded_episode_again(folder):
     assert episode["body"] == "ball" and episode["world"]
     film.draw(episode, folder / "strip.png")
     assert (folder / "strip.png").stat().st_size > 10_000
+    with monkeypatch.context() as context:
+        context.setitem(film.FILMS, "ant", kept)
+        context.setattr(film, "draw", lambda episode, file: None)
+        told = f"Privileged, told the ground truth: {', '.join(ROLES)}."
+        assert told in results.rebuild(folder).read_text()
     episode["torque"] = episode["torque"][: len(episode["torque"]) // 2]
     with pytest.raises(runs.ResultError, match="the world has changed"):
         film.draw(episode, folder / "strip.png")
@@ -120,7 +127,7 @@ def test_figure_5_has_both_bodies_and_marks_a_controller_that_is_another_now(fol
     assert results.rebuild(folder) == folder / "README.md"
     page = (folder / "README.md").read_text()
     causes = page.split("## Figure 5")[1].split("Why episodes fail:")[1]
-    assert f"| {camera[2].title} | 3 |" in causes and Failure.CONTROLLER_TIME_OUT.meaning in causes
+    assert f"| {camera[2].title} | none | 3 |" in causes and Failure.CONTROLLER_TIME_OUT.meaning in causes
     assert "| ant, by ground truth (privileged), difficulty 5 | `ant_5` |" in page and "| 73.7 % |" in page
     assert f"| ant, by ground truth (privileged), difficulty 4{tables.STALE} | `ant_4` |" in page
     assert "| ant, by its camera, difficulty 5 | `ant_camera_5` |" in page

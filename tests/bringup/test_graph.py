@@ -5,7 +5,6 @@ import re
 import signal
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,8 +20,9 @@ from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_core.bodies import ANT
 from mujoban_msgs_py import conversions, topics
-from mujoban_msgs_py.listening import ANOTHER_RUN, Received
+from mujoban_msgs_py.listening import ANOTHER_RUN
 from mujoban_msgs_py.run_identifier import run_of
+from mujoban_msgs_py.runtime import diagnostics
 from mujoban_msgs_py.topics import TICK
 from mujoban_sokoban.episodes import Episodes
 
@@ -157,10 +157,24 @@ def test_every_node_says_on_diagnostics_how_it_is(play_graph):
     graph.tap.create_subscription(
         DiagnosticArray, "/diagnostics", lambda message: heard.update({s.name: s for s in message.status}), 10
     )
-    graph.spin_until(lambda: len(heard) == len(NODES) and heard["/simulator"].message == "running")
+    shown = {"/simulator": "running", "/planner": "answering (privileged)"}
+    graph.spin_until(lambda: len(heard) == len(NODES) and all(heard[n].message == said for n, said in shown.items()))
     assert set(heard) == {f"/{name}" for name in NODES}
     planner = {value.key: value.value for value in heard["/planner"].values}
     assert "dropped messages" in planner and planner["module"] == "oracle (privileged)"
+
+
+def test_who_begins_to_listen_is_told_at_once_how_each_node_is(play_graph, monkeypatch):
+    monkeypatch.setattr(diagnostics, "PERIOD", 1000.0)
+    graph, heard = play_graph(), []
+    for _ in range(2):
+        names = set()
+        graph.tap.create_subscription(
+            DiagnosticArray, "/diagnostics", lambda m, names=names: names.update(s.name for s in m.status), 10
+        )
+        heard.append(names)
+        graph.spin_until(lambda names=names: len(names) == len(NODES))
+    assert heard == 2 * [{f"/{name}" for name in NODES}]
 
 
 def test_processes_that_are_killed_are_started_again(ros, oracles):
@@ -225,61 +239,16 @@ def test_an_episode_that_has_ended_is_not_reset_but_followed_by_the_next(play_gr
     assert [result.seed for result in graph.finish()] == [47, 48]
 
 
-def test_answers_that_come_after_an_episodes_end_are_not_taken_for_those_of_the_next(play_graph):
-    graph = play_graph(names=["simulator"], episodes=Episodes(2, 47, difficulty=2), realtime=1.0, hold_limit=3)
-    simulator, monitor = graph.simulator, graph.monitor
-    simulator._begin(0)
-    late = simulator._stamp
-    simulator._begin(1)
-    simulator._on_torque(Received(late, np.array([1.0, -1.0], np.float32), b""))
-    simulator._on_instruction(Received(late, conversions.InstructionReading(37, 2), b""))
-    assert not simulator._held_torque.any() and simulator._instruction is None
-    graph.spin_until(lambda: monitor.episode is not None and monitor.stamp == simulator._stamp)
-    state = Episodes(1, 47, difficulty=2)[0].level.abstract_state()
-    said = SimpleNamespace(
-        alone=False, instruction=conversions.InstructionReading(37, 2), truth=state, estimate=state,
-        termination=SimpleNamespace(timed_out=False),
-    )  # fmt: skip
-    for stamp, decisions in ((late, 0), (monitor.stamp, 1)):
-        monitor._joined = stamp
-        monitor._on_tick(said)
-        log = monitor._log.result(solved=False, steps=1, episode_return=0.0, last=state)
-        assert log.instructions == decisions
-
-
-def test_in_real_time_the_newest_of_late_instructions_is_in_force(play_graph):
-    graph = play_graph(names=["simulator"], realtime=1.0, hold_limit=3)
-    simulator = graph.simulator
-    simulator._begin(0)
-    first = simulator._stamp
-    for _ in range(2):
-        simulator._advance()
-    for stamp, sequence in ((first, 5), (first + TICK, 6), (first, 5)):
-        simulator._on_instruction(Received(stamp, conversions.InstructionReading(sequence, 2), b""))
-    assert simulator._instruction == (6, 2)
-    simulator._advance()
-    simulator._on_instruction(Received(first, conversions.InstructionReading(5, 2), b""))
-    assert simulator._instruction is None and simulator._in_force == (6, 2)
-
-
 @pytest.mark.parametrize("role", ["termination", "controller"])
 def test_the_proprioception_of_another_body_is_rejected_and_ends_no_node(play_graph, fresh_weights, role):
     graph = play_graph(Stack(fresh_weights.choices), Episodes(1, 0, difficulty=1), time_limit=100)
     publisher = graph.tap.create_publisher(topics.PROPRIO.type, topics.PROPRIO.name, topics.PROPRIO.qos)
     node = graph.graph.nodes[role]
     graph.spin_until(lambda: graph.simulator.ticks >= 2)
-    stamp = graph.simulator._stamp + 5 * TICK
+    stamp = graph.monitor.stamp + 6 * TICK
     publisher.publish(conversions.proprio_to_msg(conversions.header(stamp), np.zeros(ANT.proprio_size), ANT.joints))
     graph.spin_until(lambda: node.counts["rejected messages"] == 1)
     assert graph.finish()[0].steps == 100
-
-
-def test_what_was_said_to_a_robot_before_its_episode_began_is_forgotten(play_graph, fresh_weights):
-    graph = play_graph(Stack(fresh_weights.choices), Episodes(2, 0, difficulty=1), time_limit=10)
-    node = graph.graph.nodes["termination"]
-    node._said[9 * TICK] = conversions.InstructionReading(37, 2)
-    graph.spin_until(lambda: graph.simulator.ticks >= 3)
-    assert 9 * TICK not in node._said
 
 
 @pytest.mark.parametrize("effort", [[float("nan"), 0.0], [0.0, 1.5], [0.0]])

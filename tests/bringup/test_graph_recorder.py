@@ -7,6 +7,7 @@ from mujoban_msgs.msg import AbstractState
 from rclpy.serialization import deserialize_message
 
 from bringup.graph_recorder import RecorderNode
+from bringup.results import told_roles
 from bringup.rollout import ticks
 from bringup.rollout_recorder import TOPICS as ROLLOUT_TOPICS
 from bringup.rollout_recorder import Recorder
@@ -67,11 +68,15 @@ def test_the_graph_and_the_rollout_record_the_same_of_an_episode(oracles, tmp_pa
     results = play(oracles, episodes, PlayOptions(record=tmp_path / "graph", time_limit=200)).results
     assert results[0].solved
     world = World(1, max_boxes=episodes.max_boxes, time_limit=200)
-    with Recorder(tmp_path, world.body, episodes, [1, 1]) as recorder:
+    roles = told_roles(oracles.identities())
+    with Recorder(tmp_path, world.body, episodes, [1, 1], privileged=roles) as recorder:
         for tick in ticks(oracles.policy(), world, episodes, camera=True):
             recorder.write(tick)
     assert open_bag(tmp_path / "graph").about == open_bag(tmp_path / "row000").about
-    assert open_bag(tmp_path / "graph").about == {"body": "ball", "world": DEFAULT_WORLD, "max_boxes": "1"}
+    assert open_bag(tmp_path / "graph").about == {
+        "body": "ball", "world": DEFAULT_WORLD, "privileged": "estimator, termination, planner, controller",
+        "max_boxes": "1",
+    }  # fmt: skip
     graph, rollout = said(tmp_path / "graph"), said(tmp_path / "row000")
     for topic in graph:
         assert graph[topic] == rollout[topic], topic

@@ -13,6 +13,7 @@ from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import ROLES
 from mujoban_core.signals import Interrupted, interruptible
 from mujoban_estimator.bag_stream import TOPICS, stretches
+from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.bags.training import ReadReport, find_bags, open_training_bag
 from mujoban_sim.world import World
 from mujoban_sokoban.generator import TRAIN_SEEDS
@@ -124,6 +125,18 @@ def test_recordings_with_late_ends_go_on_after_an_instruction_is_completed(late,
     assert len(instructions) > 3 and {int(completed.sum()) for completed in instructions} <= after
     with pytest.raises(ValueError, match="expected one of them"):
         Options(tmp_path, undisturbed=True, late_ends=True)
+
+
+@pytest.mark.parametrize("oracle", ["planner", ""])
+def test_a_recording_and_its_bags_name_who_is_told_the_truth(oracle, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(recording, "_record_all", lambda jobs, cluster, on_end: record(jobs[0]))
+    roles = ("--oracle", oracle) if oracle else ()
+    recording.main(["--out", str(tmp_path), "--episodes", "1", "--difficulty", "1", "--time-limit", "2", *roles])
+    (bag,) = find_bags([tmp_path])
+    assert open_bag(bag).about["privileged"] == (oracle or "none")
+    count, *others = capsys.readouterr().out.splitlines()
+    assert count == "2 ticks of 1 episodes in 1 bags"
+    assert others == (["privileged, told the ground truth: planner: oracle"] if oracle else [])
 
 
 @pytest.mark.parametrize("share", [-0.1, 2.0, np.nan])

@@ -175,6 +175,17 @@ def test_a_body_that_no_single_action_turns_has_a_teacher_by_ppo_and_no_critic(t
         Options(run=run, before=before)
 
 
+@pytest.mark.parametrize(("body", "other"), [("ball", "ant"), ("ant", "ball")])
+def test_a_run_of_another_body_is_refused_before_anything_begins(tmp_path: Path, body: str, other: str) -> None:
+    before, run = finished(tmp_path / "before"), tmp_path / "run"
+    entries = commands(Options(run=before, physics=WorldOptions(body)))
+    noted = {name: {"command": command, "done": True} for name, command in entries.items()}
+    (before / "pipeline.json").write_text(json.dumps(noted))
+    assert Options(run=run, before=before, physics=WorldOptions(body)).physics.body == body
+    with pytest.raises(ValueError, match=rf"^--body {other}: --continue .*before is a run of the {body}, expected it$"):
+        Options(run=run, before=before, physics=WorldOptions(other))
+
+
 @pytest.mark.parametrize("name", EVALUATIONS)
 def test_an_evaluation_plays_levels_by_which_nothing_is_chosen(tmp_path: Path, name: str) -> None:
     command = commands(Options(run=tmp_path))[name]
@@ -255,8 +266,9 @@ def test_every_stage_but_the_planners_is_told_the_body_and_the_world(tmp_path: P
 
 @pytest.mark.parametrize("continued", [False, True])
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("body", ["ball", "ant"])
 def test_programs_know_the_options_that_they_are_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, continued: bool, device: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, continued: bool, device: str, body: str
 ) -> None:
     # What is told of a GPU can be read where there is none.
     monkeypatch.setattr(mujoban_controller.train, "usable_device", torch.device)
@@ -268,7 +280,8 @@ def test_programs_know_the_options_that_they_are_given(
         "bringup.record": bringup.record.Options,
         "bringup.evaluate": bringup.evaluate.Options,
     }
-    for name, command in commands(Options(run=tmp_path / "run", before=before, device=device, cores=16)).items():
+    run = Options(run=tmp_path / "run", before=before, device=device, cores=16, physics=WorldOptions(body))
+    for name, command in commands(run).items():
         options = read_options(programs[command[1]], command[2:], name)
         assert getattr(options, "run", tmp_path / "run" / name) == tmp_path / "run" / name
 

@@ -3,6 +3,7 @@
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Pose
 from mujoban_msgs.msg import EpisodeTruth, Instruction
 from nav_msgs.msg import OccupancyGrid
@@ -13,6 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from bringup.command import Choice, Solo, Stack
 from bringup.overlay import BAR, CELL, COLOURS, MARGIN, grid_picture, name_told
+from bringup.players import played, players
 from bringup.stack import PlayOptions, play, top_camera_size
 from bringup.video import EDGE, VideoNode
 from bringup.viz import VizNode, occupancy_grid
@@ -33,7 +35,7 @@ ENTITIES = {
     *(f"/grid/{source}/{layer}" for source in ("estimate", "ground_truth") for layer in LAYERS),
     *(f"/grid/{source}/key" for source in ("estimate", "ground_truth")), "/grid/estimate/instruction", "/now",
     "/instruction", "/instructions", "/beta/probability", "/beta/terminated", "/torque", "/reward/step",
-    "/reward/return",
+    "/reward/return", "/told",
     *(f"/milliseconds/{what}" for what in ("simulator", "estimator", "termination", "planner", "controller")),
 }  # fmt: skip
 
@@ -41,9 +43,10 @@ ENTITIES = {
 class Listener(Node):
     def __init__(self):
         super().__init__("listener")
-        self.grids, self.scenes = [], []
+        self.grids, self.scenes, self.modules = [], [], {}
         self.create_subscription(OccupancyGrid, "/viz/ground_truth/wall", self.grids.append, 10)
         self.create_subscription(MarkerArray, "/viz/scene", self.scenes.append, 10)
+        self.create_subscription(DiagnosticArray, "/diagnostics", lambda m: self.modules.update(players(m, {})), 10)
 
 
 def test_an_occupancy_grid_begins_in_the_south_west():
@@ -63,13 +66,27 @@ def test_standard_tools_see_the_layers_and_the_scene(play_graph):
     graph = play_graph(episodes=episodes)
     listener = graph.graph.add(Listener())
     graph.graph.add(VizNode())
-    graph.spin_until(lambda: listener.grids and listener.scenes and len(listener.scenes[-1].markers) == 4)
+    graph.spin_until(lambda: listener.grids and listener.scenes and len(listener.scenes[-1].markers) == 5)
     percent = np.array(listener.grids[-1].data).reshape(10, 10)[::-1]
     assert (percent == 100 * level[..., WALL]).all()
     markers = {marker.ns: marker for marker in listener.scenes[-1].markers}
     assert len(markers["target"].points) == level[..., TARGET].sum()
     assert len(markers["box"].points) == level[..., BOX].sum()
     assert markers["robot"].type == Marker.ARROW
+
+
+@pytest.mark.parametrize("told", ["planner", ""])
+def test_the_scene_of_standard_tools_names_who_is_told_the_truth(play_graph, fresh_weights, told):
+    planner = Choice("planner", "oracle") if told else Choice("planner")
+    graph = play_graph(Stack(fresh_weights.choices | {"planner": planner}), Episodes(99, 0, difficulty=1))
+    listener = graph.graph.add(Listener())
+    graph.graph.add(VizNode())
+    graph.spin_until(lambda: listener.modules.keys() == ROLES.keys())
+    del listener.scenes[:]
+    graph.spin_until(lambda: len(listener.scenes) > 2)
+    (text,) = [marker for marker in listener.scenes[-1].markers if marker.type == Marker.TEXT_VIEW_FACING]
+    assert (text.action == Marker.ADD) == bool(told)
+    assert text.action == Marker.DELETE or text.text == "privileged, told the ground truth:\nplanner"
 
 
 def test_the_live_view_names_torques_by_their_joints_whatever_the_body():
@@ -99,6 +116,22 @@ def test_a_recording_of_the_live_view_holds_every_entity(
     assert {part.entity_path for part in chunk.RrdReader(str(file)).stream()} >= ENTITIES
 
 
+def test_a_recording_of_the_live_view_names_at_every_moment_who_is_told_the_truth(play_graph, fresh_weights, tmp_path):
+    chunk = pytest.importorskip("rerun.chunk")
+    from bringup.live import LiveNode
+
+    file = tmp_path / "play.rrd"
+    graph = play_graph(fresh_weights, Episodes(1, 0, difficulty=1), time_limit=40)
+    graph.graph.add(LiveNode(parameter_overrides=[Parameter("save", value=str(file))]))
+    graph.finish()
+    graph.__exit__(None, None, None)
+    parts = [part for part in chunk.RrdReader(str(file)).stream() if part.entity_path == "/told"]
+    assert all(part.is_static for part in parts), "it holds for the whole recording"
+    said = [row for part in parts for row in part.to_record_batch().to_pylist()]
+    latest = max(said, key=lambda row: row["rerun.controls.RowId"])
+    assert latest["TextDocument:text"] == ["**privileged, told the ground truth: planner**"]
+
+
 def test_a_map_tells_robot_box_and_solved_box_apart_and_shows_the_target_below():
     state = Level.from_text("######\n#+$*.#\n#   $#\n######\n").abstract_state()
     picture = grid_picture(state, 16)
@@ -110,7 +143,7 @@ def test_a_map_tells_robot_box_and_solved_box_apart_and_shows_the_target_below()
 
 def test_the_live_view_names_instruction_and_modules_and_marks_those_that_are_told_the_truth():
     pytest.importorskip("rerun")
-    from bringup.live_layout import Shown, played, text
+    from bringup.live_layout import Shown, text, told
 
     truth = EpisodeTruth(episode=2, seed=7, difficulty=3, level="#@$.*#", step=40, boxes_on_target=1)
     teacher = played("learned (privileged)", "/home/me/teacher.safetensors")
@@ -120,8 +153,30 @@ def test_the_live_view_names_instruction_and_modules_and_marks_those_that_are_to
     for part in ("| 2: seed 7, difficulty 3 |", "| 2.0 s |", "| 1 of 2 boxes |", "| **oracle** |", "| learned |"):
         assert part in shown
     assert "| **learned teacher.safetensors (privileged)** |" in shown and "| termination | not heard yet |" in shown
-    alone = text(Shown(None, truth, {"agent": "mine:Drive (privileged)"}))
+    assert told(modules) == (
+        "**privileged, told the ground truth: planner, controller**\n\nnot heard yet: termination"
+    )
+    assert told(dict.fromkeys(ROLES, "learned")) == "nobody"
+    agent = {"agent": "mine:Drive (privileged)"}
+    alone = text(Shown(None, truth, agent))
     assert "| agent | **mine:Drive (privileged)** |" in alone and "planner" not in alone
+    assert told(agent) == "**privileged, told the ground truth: agent**"
+
+
+def test_what_a_later_run_does_not_play_is_forgotten():
+    def said(**modules):
+        statuses = [
+            DiagnosticStatus(name=f"/{role}", values=[KeyValue(key="module", value=module)])
+            for role, module in modules.items()
+        ]
+        return DiagnosticArray(status=statuses)
+
+    told = players(said(planner="oracle (privileged)", simulator="running"), {})
+    both = players(said(estimator="learned"), told)
+    assert both == {"planner": "oracle (privileged)", "estimator": "learned"}
+    assert players(DiagnosticArray(status=[DiagnosticStatus(name="/simulator")]), both) == both
+    agent = players(said(agent="random"), both)
+    assert agent == {"agent": "random"} and players(said(planner="learned"), agent) == {"planner": "learned"}
 
 
 def test_a_video_shows_both_views_and_what_the_modules_say(play_graph, tmp_path):

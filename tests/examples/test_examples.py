@@ -148,7 +148,11 @@ def test_a_bad_argument_is_one_line(run, name, argument, said):
 
 def test_a_module_is_replaced(run):
     said = run("replace_a_module.py", 2)
-    assert "oracle planner\n  solved 2 of 2" in said and "random planner\n  solved" in said
+    by_oracle, by_random = said.split("random planner\n  solved")
+    assert by_oracle.startswith("oracle planner\n  solved 2 of 2")
+    others = "termination: oracle, planner: oracle, controller: oracle"
+    assert f"privileged, told the ground truth: estimator: oracle, {others}" in by_oracle
+    assert "estimator: oracle, termination: oracle, controller: oracle" in by_random
 
 
 @pytest.mark.parametrize("world", WORLDS)
