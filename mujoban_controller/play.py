@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -196,8 +197,14 @@ class ExploringPlayer(CameraPlayer):
 
 def steadied(scale: Tensor, share: float) -> Tensor:
     """Return scales, [B, U], that are 0 for about that share of the robots: they play by the mean of their policy."""
-    count = torch.arange(len(scale) + 1, dtype=torch.float64) * share
-    return scale.masked_fill((count.floor().diff() > 0.0)[:, None], 0.0)
+    return scale.masked_fill(_steady(len(scale), share), 0.0)
+
+
+@cache
+def _steady(batch: int, share: float) -> Tensor:
+    """Return which of so many robots they are, [B, 1]."""
+    count = torch.arange(batch + 1, dtype=torch.float64) * share
+    return (count.floor().diff() > 0.0)[:, None]
 
 
 def drawn_torque(
