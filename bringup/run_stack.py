@@ -97,7 +97,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
             reporting.results = results
             show(monitor, results)
 
-        outcome = play_graph(stack, episodes, how, on_refresh=on_refresh)
+        outcome = play_graph(stack, episodes, how, on_refresh=on_refresh, on_break=reporting.note)
     table = None if options.headless else summary(outcome.results)
     reporting.finish(outcome.results, above=table, **outcome.figures())
     return 0
