@@ -37,10 +37,10 @@ class Options:
     processes: bool = False
     """Run each node in a process of its own."""
     intra_process: bool = True
-    """Whether messages are handed over within the process while nobody outside reads their topic, or the middleware has
-    them all."""
+    """Messages are handed over within the process while nobody outside reads their topic; with --no-intra-process the
+    middleware sends them all."""
     headless: bool = False
-    """Show no live view."""
+    """Show in the terminal only how many episodes have ended, not what goes on."""
     record: FolderPath = None
     """Record all topics into a bag."""
     allow_test_seeds: bool = False
