@@ -144,7 +144,10 @@ def _play(
 
             # A result through the graph is one of messages that were sent.
             how = PlayOptions(world=play.world, time_limit=play.time_limit, intra_process=False)
-            outcome = play_graph(stack, episodes, how, on_refresh=lambda _, ended: show(ended), refresh_period=1.0)
+            outcome = play_graph(
+                stack, episodes, how, on_refresh=lambda _, ended: show(ended), refresh_period=1.0,
+                on_break=reporting.note,
+            )  # fmt: skip
             return outcome.results, outcome.figures()
         if policy is None:
             from bringup.cluster import evaluate_on_cluster

@@ -12,7 +12,6 @@ import os
 import signal
 import socket
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Final, NoReturn
@@ -22,6 +21,7 @@ import rerun_cli
 
 from bringup.options import LOOPBACK, address_family, check_own_address
 from mujoban_core import children
+from mujoban_msgs_py.runtime.shared_memory import RunFolder
 
 _MEMORY: Final = "256MiB"
 """What the server keeps for a browser that opens the page later."""
@@ -37,6 +37,7 @@ class LiveServer:
     Attributes:
         stream: Address to which a `rerun.RecordingStream` connects.
         page: Address for the browser.
+        folder: What the server's settings lie in; the next run removes that of one that was killed.
     """
 
     def __init__(self, address: str, grpc_port: int, web_port: int) -> None:
@@ -56,12 +57,12 @@ class LiveServer:
         self.stream = f"rerun+http://{_host(LOOPBACK if unspecified else address)}:{grpc_port}/proxy"
         seen = socket.gethostname() if unspecified else _host(address)
         self.page = f"http://{seen}:{web_port}/?url={quote(f'rerun+http://{seen}:{grpc_port}/proxy', safe=':/')}"
-        self._settings = tempfile.TemporaryDirectory(prefix="mujoban-live-")
+        self.folder = RunFolder()
         command = (
             sys.executable, "-m", "bringup.live_server", "--serve-web", "--bind", address, "--port", str(grpc_port),
             "--web-viewer-port", str(web_port), "--server-memory-limit", _MEMORY,
         )  # fmt: skip
-        self._process = children.start(command, _private(Path(self._settings.name)))
+        self._process = children.start(command, _private(self.folder.path))
         try:
             for port in (grpc_port, web_port):
                 self._await(LOOPBACK if unspecified else address, port)
@@ -83,7 +84,7 @@ class LiveServer:
     def close(self) -> None:
         """Stop serving."""
         children.stop([self._process])
-        self._settings.cleanup()
+        self.folder.remove()
 
 
 def _host(address: str) -> str:

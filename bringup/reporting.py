@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from rich.console import Console
 from rich.table import Table
@@ -20,6 +20,9 @@ from mujoban_core.reports import keep_report
 from mujoban_core.signals import StopSignal
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import seed_range
+
+if TYPE_CHECKING:
+    from bringup.stack import Outcome
 
 Route = Literal["in process", "graph"]
 """What carries steps between world and modules: the memory of a process, or ROS messages."""
@@ -73,6 +76,7 @@ class Reporting:
 
     Attributes:
         results: Outcomes so far, in any order.
+        figures: Further entries of what is reported after an interruption, such as counts.
     """
 
     def __init__(
@@ -90,6 +94,7 @@ class Reporting:
             ValueError: If levels are generated from seeds that do not all lie in one range.
         """
         self.results: Sequence[EpisodeResult] = []
+        self.figures: Mapping[str, Any] = {}
         self._path, self._weights, self._asked = path, weights, len(episodes)
         self._game = {"body": game["body"], "world": game["world"], "played": dict(game)}
         # Apart from the game, which is the same in all parts of a longer run.
@@ -98,6 +103,10 @@ class Reporting:
         self._generated = not episodes.source.levels
         if self._generated:
             seed_range(episodes.seed, len(episodes))  # refuses what `finish` could not report
+
+    def note(self, outcome: Outcome) -> None:
+        """Note what came of a run of the graph that was broken off."""
+        self.results, self.figures = outcome.results, outcome.figures()
 
     def finish(self, results: Sequence[EpisodeResult], *, above: Table | None = None, **extra: Any) -> None:
         """Write the report and print the summary.
@@ -132,4 +141,5 @@ class Reporting:
         """Report what there is after an interruption or an error: also that test levels were used."""
         if isinstance(value, KeyboardInterrupt | SystemExit | Exception) and self.results:
             with StopSignal():
-                self.finish(sorted(self.results, key=lambda result: result.seed), interrupted=self._asked)
+                played = sorted(self.results, key=lambda result: result.seed)
+                self.finish(played, interrupted=self._asked, **self.figures)

@@ -37,10 +37,10 @@ class Options:
     processes: bool = False
     """Run each node in a process of its own."""
     intra_process: bool = True
-    """Whether messages are handed over within the process while nobody outside reads their topic, or the middleware has
-    them all."""
+    """Messages are handed over within the process while nobody outside reads their topic; with --no-intra-process the
+    middleware sends them all."""
     headless: bool = False
-    """Show no live view."""
+    """Show in the terminal only how many episodes have ended, not what goes on."""
     record: FolderPath = None
     """Record all topics into a bag."""
     allow_test_seeds: bool = False
@@ -97,7 +97,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
             reporting.results = results
             show(monitor, results)
 
-        outcome = play_graph(stack, episodes, how, on_refresh=on_refresh)
+        outcome = play_graph(stack, episodes, how, on_refresh=on_refresh, on_break=reporting.note)
     table = None if options.headless else summary(outcome.results)
     reporting.finish(outcome.results, above=table, **outcome.figures())
     return 0

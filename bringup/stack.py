@@ -98,6 +98,7 @@ def play(
     *,
     on_refresh: Callable[[MonitorNode, Sequence[EpisodeResult]], None] | None = None,
     refresh_period: float = 0.1,
+    on_break: Callable[[Outcome], None] | None = None,
 ) -> Outcome:
     """Play episodes through the graph.
 
@@ -107,6 +108,7 @@ def play(
         options: How the graph is run; in lockstep and in this process by default.
         on_refresh: Called every `refresh_period` seconds with what the graph is doing.
         refresh_period: Seconds.
+        on_break: Called with what came of it so far when an interruption or an error ends the run.
 
     Raises:
         ValueError: If a module cannot be loaded.
@@ -150,19 +152,28 @@ def play(
             listeners.append(graph.add(video))
         if options.view is not None:
             exits.enter_context(viewer(options.view, options.run))
-        if options.processes:
-            processes = exits.enter_context(Processes(parameters))
+        processes = exits.enter_context(Processes(parameters)) if options.processes else None
+        if processes is not None:
             monitor.watch.ghosts = processes.ghosts
             monitor.create_timer(RESPAWN_PERIOD, lambda: _supervise(processes, monitor))
         if on_refresh is not None:
             monitor.create_timer(refresh_period, lambda: on_refresh(monitor, monitor.results))
-        spin(graph.executor, monitor.finished, stop)
-        monitor.finished.result()
+        try:
+            spin(graph.executor, monitor.finished, stop)
+            monitor.finished.result()
+        except BaseException:
+            if on_break is not None:
+                on_break(_outcome(graph, monitor, processes))
+            raise
         if on_refresh is not None:  # a short run may have ended before the first refresh
             on_refresh(monitor, monitor.results)
         _drain(graph.executor, listeners, monitor.stamp)
-        counts = graph.counts() + (processes.counts() if options.processes else Counter())
-        return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts, _answer_ms(graph))
+        return _outcome(graph, monitor, processes)
+
+
+def _outcome(graph: InProcess, monitor: MonitorNode, processes: Processes | None) -> Outcome:
+    counts = graph.counts() + (Counter() if processes is None else processes.counts())
+    return Outcome(monitor.results, monitor.ticks, monitor.ticks_per_second, counts, _answer_ms(graph))
 
 
 def _answer_ms(graph: InProcess) -> dict[str, float]:

@@ -343,6 +343,7 @@ class SimulatorNode(GraphNode):
         running = self._started is not None and not self.finished.done()
         response.success = running and not self._ended
         if response.success:
+            self.counts["resets"] += 1  # who plays a level twice does better
             self._begin(self._place.index)
             spec = self.episodes[self._place.index]
             response.message = f"episode {self._place.starts} starts with seed {spec.seed}"

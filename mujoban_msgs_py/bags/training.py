@@ -226,14 +226,21 @@ def episode_ticks(
             yield EpisodeTick(reading, tick.values)
 
 
-def episodes(bag: Bag, wanted: Sequence[Topic]) -> Iterator[list[tuple[Any, ...]]]:
+def episodes(
+    bag: Bag, wanted: Sequence[Topic], *, allow_test_seeds: bool = False
+) -> Iterator[list[tuple[Any, ...]]]:
     """Yield the ticks of each episode, in the order of the topics, from its start up to a tick that is missing.
+
+    Args:
+        bag: As `open_training_bag` returns it.
+        wanted: Topics, with `topics.TRUE_EPISODE` among them.
+        allow_test_seeds: As of `episode_ticks`.
 
     Raises:
         BagError: As `episode_ticks`.
     """
     found: list[tuple[Any, ...]] = []
-    for reading, values in episode_ticks(bag, wanted):
+    for reading, values in episode_ticks(bag, wanted, allow_test_seeds=allow_test_seeds):
         if reading.step == 0 and found:
             yield found
             found = []

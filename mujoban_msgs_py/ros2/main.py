@@ -19,6 +19,7 @@ FAMILIES = ("bag", "interface", "node", "param", "service", "topic")
 INTERRUPTED = 2
 """Exit status after Ctrl-C, as of the genuine command: the signal's number."""
 PACKAGE = "mujoban_msgs"
+_ELSEWHERE = "ROS 2 itself has more, such as launch and run; nodes start without: docs/graph.md#run-nodes-on-their-own"
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -78,7 +79,11 @@ def run(arguments: Sequence[str]) -> int:
     from mujoban_msgs_py.runtime.discovery import confine_discovery
 
     confine_discovery()
-    options = make_parser(next(iter(arguments), None)).parse_args(arguments)
+    family = next(iter(arguments), "")
+    parser = make_parser(family)
+    if not family.startswith("-") and family not in ("", *FAMILIES):
+        parser.error(f"no command {family!r} here, expected one of {', '.join(FAMILIES)}. {_ELSEWHERE}")
+    options = parser.parse_args(arguments)
     try:
         status = options.run(options)
         sys.stdout.flush()
@@ -97,7 +102,9 @@ def run(arguments: Sequence[str]) -> int:
 
 def make_parser(family: str | None = None) -> argparse.ArgumentParser:
     """Return the parser of all verbs, or of those of one family, which takes less time to import."""
-    parser = argparse.ArgumentParser(prog="ros2", description="ros2 is an extensible command-line tool for ROS 2.")
+    parser = argparse.ArgumentParser(
+        prog="ros2", description="The most used commands of ROS 2, where it is not installed.", epilog=_ELSEWHERE
+    )
     commands = parser.add_subparsers(title="Commands", metavar="command", required=True)
     for name in [family] if family in FAMILIES else FAMILIES:
         importlib.import_module(f"mujoban_msgs_py.ros2.{name}").add_verbs(commands)

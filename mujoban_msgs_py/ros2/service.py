@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from rclpy.client import Client
 
 from mujoban_msgs_py.ros2.messages import fill, parse_values
 from mujoban_msgs_py.ros2.session import (
@@ -59,14 +60,27 @@ def show_type(options: argparse.Namespace) -> int:
     """Print a service's type; without such a service, nothing and status 1, as the genuine command."""
     name = full_name(options.service_name)
     with Session(options) as session:
+        session.until(lambda: bool(_types(session, name)), session.limit)
+        kinds = _types(session, name)
+        print(*kinds, sep="\n", end="\n" if kinds else "")
+        return 0 if kinds else 1
 
-        def types() -> list[str]:
-            return dict(session.node.get_service_names_and_types()).get(name, [])
 
-        session.until(lambda: bool(types()), session.limit)
-        for kind in types():
-            print(kind)
-        return 0 if types() else 1
+def _types(session: Session, name: str) -> list[str]:
+    return dict(session.node.get_service_names_and_types()).get(name, [])
+
+
+def _await(session: Session, client: Client, kind: str) -> None:
+    """Wait for a service; one of another type is a CommandError at once."""
+    name = client.srv_name
+
+    def others() -> set[str]:
+        return {*_types(session, name)} - {kind}
+
+    complaint = f"the service {name} did not become available"
+    session.wait_for(lambda: client.service_is_ready() or bool(others()), complaint)
+    if not client.service_is_ready():
+        raise CommandError(f"the service {name} is of type {', '.join(sorted(others()))}, not {kind}")
 
 
 def call(options: argparse.Namespace) -> int:
@@ -81,7 +95,7 @@ def call(options: argparse.Namespace) -> int:
         client = session.node.create_client(kind, name)
         if not client.service_is_ready():
             print("waiting for service to become available...", flush=True)
-            session.wait_for(client.service_is_ready, f"the service {name} did not become available")
+            _await(session, client, f"{kind.__module__.partition('.')[0]}/srv/{kind.__name__}")
         while True:
             request = kind.Request()
             fill(request, values, session.node.get_clock().now().to_msg())

@@ -18,6 +18,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from mujoban_msgs_py.runtime.discovery import held_domains, is_alone
 from mujoban_msgs_py.runtime.tick_node import ros_context
 
 DISCOVERY_LIMIT: Final = 5.0
@@ -90,7 +91,10 @@ class Session:
         self.until(lambda: False, seconds)
 
     def settle(self, graph: Callable[[], FoundT]) -> FoundT:
-        """Return what `graph` says once others are there and it has stopped changing, or after `--spin-time`."""
+        """Return what `graph` says once others are there and it has stopped changing, or after `--spin-time`.
+
+        Where no others can be there it says so at once, and nobody is waited for.
+        """
         if self._spin_time is not None:
             self.spin_for(self._spin_time)
             return graph()
@@ -98,6 +102,9 @@ class Session:
         end = time.monotonic() + DISCOVERY_LIMIT * patience
         seen, since = graph(), time.monotonic()
         while time.monotonic() < end:
+            if is_alone(self.domain):
+                print(f"warning: {self._lonely()}", file=sys.stderr)
+                return graph()
             known = self._others_known()
             if known and time.monotonic() >= since + QUIET_TIME * patience:
                 return seen
@@ -111,6 +118,16 @@ class Session:
         return seen
 
     @property
+    def domain(self) -> int:
+        """The ROS domain."""
+        return self.node.context.get_domain_id()
+
+    def _lonely(self) -> str:
+        elsewhere = [str(domain) for domain in held_domains() if domain != self.domain]
+        there = f", but graphs run in {', '.join(elsewhere)}" if elsewhere else ""
+        return f"nobody else is in ROS domain {self.domain} of this machine{there} (ROS_DOMAIN_ID)"
+
+    @property
     def limit(self) -> float:
         """Seconds within which what exists has to be discovered."""
         return DISCOVERY_LIMIT * _patience() if self._spin_time is None else self._spin_time
@@ -118,7 +135,7 @@ class Session:
     def _others(self) -> list[tuple[str, str]]:
         """Return name and namespace of all other nodes that have been discovered."""
         names = self.node.get_node_names_and_namespaces()
-        return [(name, namespace) for name, namespace in names if not name.startswith("_ros2cli_")]
+        return [(name, namespace) for name, namespace in names if name != self.node.get_name()]
 
     def _others_known(self) -> bool:
         """Return whether others have been discovered, and of each of them something that it publishes or serves.
@@ -142,7 +159,7 @@ class Session:
             CommandError: With `complaint` if it is not within the time for discovery.
         """
         if not self.until(found, self.limit):
-            raise CommandError(complaint)
+            raise CommandError(f"{complaint}; {self._lonely()}" if is_alone(self.domain) else complaint)
 
     def topic_type(self, topic: str, complaint: str | None = None) -> str:
         """Return the type of a topic once it has been discovered.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from collections import deque
 from collections.abc import Callable
@@ -110,8 +111,13 @@ def _watch(
         raise CommandError(f"--window must be a positive integer, got {options.window}")
     topic = full_name(options.topic_name)
     with Session(options, sim_time=getattr(options, "use_sim_time", False)) as session:
-        complaint = f"topic [{topic}] does not appear to be published yet"
-        kind = import_type(session.topic_type(topic, complaint), "msg")
+        try:
+            name = session.topic_type(topic, f"topic [{topic}] does not appear to be published yet")
+        except CommandError as missing:
+            print(f"WARNING: {missing}", file=sys.stderr)
+            session.until(lambda: topic in dict(session.node.get_topic_names_and_types()), None)
+            name = session.topic_type(topic)
+        kind = import_type(name, "msg")
         if stamped and not hasattr(kind, "header"):
             raise CommandError("msg does not have header")
         receive = make_qos(10, reliable=False)

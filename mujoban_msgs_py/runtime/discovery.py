@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import socket
 from pathlib import Path
 from typing import Final
@@ -14,6 +15,9 @@ PROFILES: Final = "FASTRTPS_DEFAULT_PROFILES_FILE"
 LOOPBACK: Final = Path(__file__).with_name("loopback.xml")
 HIGHEST_DOMAIN: Final = 232
 """Beyond it there are no ports left for a domain: Fast DDS would end the process."""
+_PORTS_OF_A_DOMAIN: Final = 250
+"""UDP ports of each domain, from 7400 on; its participants have the even ones from the tenth on (DDSI-RTPS)."""
+_LOCK: Final = "mujoban-ros-domain-"
 _FAST_DDS: Final = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp")
 
 
@@ -61,10 +65,34 @@ def lock_domain(domain: int) -> socket.socket | None:
     """
     holder = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        holder.bind(f"\0mujoban-ros-domain-{domain}")
+        holder.bind(f"\0{_LOCK}{domain}")
     except OSError as error:
         holder.close()
         if error.errno == errno.EADDRINUSE:
             return None
         raise
     return holder
+
+
+def held_domains() -> list[int]:
+    """Return the ROS domains that graphs of this machine hold."""
+    return sorted({int(domain) for domain in re.findall(rf"@{_LOCK}(\d+)", Path("/proc/net/unix").read_text())})
+
+
+def is_alone(domain: int) -> bool:
+    """Tell whether the one participant that this process has in a ROS domain is the only one that can be met there.
+
+    It looks for the ports of others. Where nodes may reach beyond this host, or speak through other than Fast DDS,
+    nobody can tell.
+    """
+    if reaches_further() or os.environ.get("RMW_IMPLEMENTATION", _FAST_DDS[0]) not in _FAST_DDS:
+        return False
+    lines = [line.split() for name in ("udp", "udp6") for line in _lines(Path("/proc/net", name))]
+    ports = {int(fields[1].rpartition(":")[2], 16) for fields in lines}
+    first = 7400 + _PORTS_OF_A_DOMAIN * domain
+    return len(ports & {*range(first + 10, first + _PORTS_OF_A_DOMAIN, 2)}) == 1
+
+
+def _lines(table: Path) -> list[str]:
+    """Return the lines of a table of sockets, none where the kernel has none."""
+    return table.read_text().splitlines()[1:] if table.exists() else []

@@ -307,7 +307,7 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
         # Of the process's own the first is its name.
         given = _without_ros_args(args)[args is None :]
         if {"-h", "--help"} & {*given}:
-            print(inspect.getdoc(make) or "", f"Arguments: {_USAGE}", sep="\n\n")
+            print(*_descriptions(make), f"Arguments: {_USAGE}", sep="\n\n")
             return 0
         if given:
             raise ValueError(f"{given[0]} is no option of a node, expected {_USAGE}")
@@ -319,6 +319,14 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     return 0
+
+
+def _descriptions(make: Callable[[], Node]) -> list[str]:
+    """Return what a node says of itself, and of the parameters that it has by its bases."""
+    own = inspect.getdoc(make) or ""  # its base's, where it has none
+    bases = make.__mro__[1:] if isinstance(make, type) else ()
+    told = {base.__name__: inspect.cleandoc(base.__doc__ or "") for base in bases}
+    return [own, *(f"{name}: {text}" for name, text in told.items() if "\nParameters:\n" in text and text != own)]
 
 
 def _without_ros_args(args: Sequence[str] | None) -> Sequence[str]:

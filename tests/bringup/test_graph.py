@@ -220,7 +220,7 @@ def test_reset_starts_the_same_episode_again(play_graph):
     graph.spin_until(lambda: graph.simulator.ticks >= 20)
     assert graph.call(Trigger, "/reset", Trigger.Request()).success
     (result,) = graph.finish()
-    assert result.solved and result.seed == 47
+    assert result.solved and result.seed == 47 and graph.simulator.counts["resets"] == 1
     episodes = graph.said.episodes.values()
     assert [e.episode for e in episodes if e.step == 0] == [1, 2]
     assert len({(e.seed, e.level) for e in episodes}) == 1

@@ -8,11 +8,13 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from bringup.run_stack import Options
 from mujoban_core.program import read_options
+from mujoban_msgs_py.runtime.shared_memory import clear_shared_memory
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (
@@ -131,10 +133,13 @@ def test_the_live_view_is_served_on_this_machine_alone_and_ends_with_a_parent_th
     pytest.importorskip("rerun")
     code = (
         "import time; from bringup.live_server import LiveServer; "
-        "server = LiveServer('127.0.0.1', 29776, 29790); print(server.page, flush=True); time.sleep(300)"
+        "server = LiveServer('127.0.0.1', 29776, 29790); print(server.page, server.folder.path, flush=True); "
+        "time.sleep(300)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    page = parent.stdout.readline()
+    page, folder = parent.stdout.readline().split()
+    clear_shared_memory()
+    assert list(Path(folder).iterdir())
     web_port, grpc_port = (int(port) for port in re.findall(r"127\.0\.0\.1:(\d+)/", page))
     elsewhere = "127.0.0.2"  # what listens on every interface listens there too
     assert [takes("127.0.0.1", port) for port in (web_port, grpc_port)] == [True, True]
@@ -145,6 +150,8 @@ def test_the_live_view_is_served_on_this_machine_alone_and_ends_with_a_parent_th
     while takes("127.0.0.1", web_port):
         assert time.monotonic() < deadline, "the server lives on"
         time.sleep(0.05)
+    clear_shared_memory()
+    assert not Path(folder).exists()
 
 
 def takes(address, port):

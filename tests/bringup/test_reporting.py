@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+from collections import Counter
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
@@ -11,13 +12,15 @@ from unittest.mock import Mock
 import pytest
 from commands import ALL_ORACLES, UNSOLVABLE, run
 
-from bringup import evaluate, run_stack
+from bringup import evaluate, run_stack, stack
 from bringup.command import Stack
+from bringup.graph import InProcess
 from bringup.options import EpisodeOptions
 from bringup.reporting import Reporting, played
 from bringup.results import EpisodeResult
 from mujoban_core.bodies import ANT
 from mujoban_core.files import digest
+from mujoban_core.signals import Interrupted
 from mujoban_planner.deliberation import Deliberation
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import generate_level
@@ -99,6 +102,23 @@ def test_an_interrupted_evaluation_reports_what_it_has(tmp_path):
     content = json.loads(path.read_text())
     assert content["interrupted"] == 400 and 40 <= len(content["episodes"]) < 400
     assert "interrupted: 400 episodes were asked for" in out
+
+
+@pytest.mark.parametrize("command", [(run_stack, "--headless"), (evaluate, "--graph")])
+def test_an_interrupted_run_of_the_graph_reports_what_disturbed_it(tmp_path, capfd, monkeypatch, command):
+    path, spin = tmp_path / "report.json", stack.spin
+
+    def interrupted(*arguments):
+        spin(*arguments)
+        raise Interrupted(signal.SIGINT)
+
+    monkeypatch.setattr(stack, "spin", interrupted)
+    monkeypatch.setattr(InProcess, "counts", lambda graph: Counter({"monitor: foreign publishers": 1}))
+    few = ["--difficulty", 1, "--episodes", 1, "--time-limit", 3, *ALL_ORACLES]
+    assert run(*command, *few, "--json", path) == 130
+    content = json.loads(path.read_text())
+    assert content["interrupted"] == 1 and content["counts"] == {"monitor: foreign publishers": 1}
+    assert "monitor: foreign publishers: 1" in capfd.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from mujoban_core.plugins import ROLES
 from mujoban_sim.presets import WORLDS
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
-from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
+from mujoban_sokoban.generator import PLAY_SEEDS, TRAIN_SEEDS, generate_level
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -176,6 +176,15 @@ def test_a_bag_is_replayed_with_room_for_as_many_boxes_as_it_was_recorded_with(r
             recorder.write(tick)
     (bag,) = (tmp_path / "bag").iterdir()
     assert f"seed {spec.seed}: 200 ticks, at most 0.0e+00 apart" in run("replay_a_bag.py", bag)
+
+
+def test_a_bag_of_levels_that_are_not_for_training_is_replayed_too(run, oracles, tmp_path):
+    spec = EpisodeSpec(generate_level(1, PLAY_SEEDS.start), PLAY_SEEDS.start)
+    with Recorder(tmp_path / "bag", BALL, [spec], [1]) as recorder:
+        for tick in ticks(oracles.policy(), World(1, max_boxes=1, time_limit=3), [spec], camera=True):
+            recorder.write(tick)
+    (bag,) = (tmp_path / "bag").iterdir()
+    assert run("replay_a_bag.py", bag) == f"seed {spec.seed}: 3 ticks, at most 0.0e+00 apart\n"
 
 
 @pytest.mark.parametrize(

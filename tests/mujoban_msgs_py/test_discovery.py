@@ -1,6 +1,7 @@
 """How far nodes reach, by the environment that they find."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -18,6 +19,8 @@ node = rclpy.create_node("lonely")
 print("made", flush=True)
 time.sleep(60)
 """
+DOMAIN = 102 + os.getpid() % 100
+"""Which no other test uses."""
 
 
 @pytest.mark.parametrize(
@@ -51,3 +54,32 @@ def test_a_node_listens_on_the_loopback_interface_alone_and_keeps_nothing_in_sha
         finally:
             child.kill()
     assert sockets == {"127.0.0.1"} and mapped == []
+
+
+def test_who_is_alone_in_a_domain_knows_it_and_where_graphs_run(monkeypatch):
+    monkeypatch.setenv(discovery.DOMAIN, str(DOMAIN))
+    for variable in (RANGE, PROFILES):
+        monkeypatch.delenv(variable, raising=False)
+    command = [sys.executable, "-m", "mujoban_msgs_py.ros2.main", "node", "list"]
+    graph = discovery.lock_domain(DOMAIN + 100)
+    alone = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert alone.stdout == "" and f"nobody else is in ROS domain {DOMAIN} of this machine, but" in alone.stderr
+    assert DOMAIN + 100 in map(int, re.findall(r"\d+", alone.stderr))
+    graph.close()
+    with subprocess.Popen([sys.executable, "-c", NODE], stdout=subprocess.PIPE, text=True) as child:
+        try:
+            assert child.stdout is not None and child.stdout.readline() == "made\n"
+            met = subprocess.run(command, capture_output=True, text=True, check=True)
+        finally:
+            child.kill()
+    assert met.stdout == "/lonely\n" and met.stderr == ""
+
+
+@pytest.mark.parametrize(("variable", "value"), [(RANGE, "SUBNET"), ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")])
+def test_who_cannot_know_of_others_does_not_call_itself_alone(monkeypatch, variable, value):
+    monkeypatch.delenv(PROFILES, raising=False)
+    monkeypatch.setattr(discovery, "_lines", lambda table: [f"0: 0100007F:{7410 + 250 * DOMAIN:04X} 00000000:0000 07"])
+    monkeypatch.setenv(RANGE, "LOCALHOST")
+    assert discovery.is_alone(DOMAIN)
+    monkeypatch.setenv(variable, value)
+    assert not discovery.is_alone(DOMAIN)

@@ -197,6 +197,20 @@ def test_services_are_listed_and_called(talker):
     text = ros2("service", "call", "/pause", "std_srvs/srv/SetBool", "{data: true}")
     assert "requester: making request: std_srvs.srv.SetBool_Request(data=True)\n\nresponse:\n" in text
     assert "std_srvs.srv.SetBool_Response(success=True, message='was asked True')" in text
+    refused = ros2("service", "call", "/pause", "std_srvs/srv/Empty", status=1)
+    assert "error: the service /pause is of type std_srvs/srv/SetBool, not std_srvs/srv/Empty" in refused
+
+
+def test_hz_waits_for_a_topic_that_is_not_there_yet(talker):
+    process = start("topic", "hz", "/later", "--spin-time", "0.2")
+    assert "WARNING: topic [/later] does not appear to be published yet" in process.stderr.readline()
+    later = talker.create_publisher(String, "/later", 10)
+    timer = talker.create_timer(0.05, lambda: later.publish(String()))
+    assert process.stdout.readline().startswith("average rate: ")
+    process.terminate()
+    process.wait(60)
+    talker.destroy_timer(timer)
+    talker.destroy_publisher(later)
 
 
 @pytest.mark.parametrize(
@@ -211,10 +225,11 @@ def test_services_are_listed_and_called(talker):
         (["bag", "info", "/nowhere"], "no bag at /nowhere"),
         (["bag", "record"], "nothing to record"),
         (["topic", "fly"], "invalid choice: 'fly'"),
+        (["launch", "mujoban.launch.py"], "no command 'launch' here, expected one of bag, "),
     ],
 )
 def test_bad_input_is_one_line_and_has_the_status_of_the_genuine_command(arguments, expected):
-    assert expected in ros2(*arguments, status=2 if "choice" in expected else 1)
+    assert expected in ros2(*arguments, status=2 if "choice" in expected or "command" in expected else 1)
 
 
 def test_records_until_interrupted(talker, tmp_path):

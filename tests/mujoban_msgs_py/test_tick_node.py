@@ -31,6 +31,22 @@ class Waiting(TickNode):
             self._receive(topic, None, Serialised(serialize_message(message), topic.type))
 
 
+class Deep(Waiting):
+    """Has a depth.
+
+    Parameters:
+        depth: How deep it is.
+    """
+
+
+class Wider(Deep):
+    """Has a width, too.
+
+    Parameters, beside those of `Deep`:
+        width: How wide it is.
+    """
+
+
 class Prompt(Waiting):
     """Answers every tick at once, with something."""
 
@@ -70,6 +86,13 @@ def test_a_node_refuses_arguments_that_are_not_ros_and_tells_of_itself_when_aske
     assert "error: --weights is no option of a node, expected --ros-args -p NAME:=VALUE" in capsys.readouterr().err
     assert run_node(Waiting, ["--ros-args", "-p", "a:=1", "--", "--help"]) == 0
     assert "--ros-args -p NAME:=VALUE" in capsys.readouterr().out
+
+
+def test_a_node_tells_of_the_parameters_that_it_has_by_its_base_once(capsys):
+    for node in (Wider, type("Wider", (Wider,), {})):
+        assert run_node(node, ["--help"]) == 0
+        said = capsys.readouterr().out
+        assert said.startswith("Has a width, too.") and said.count("width: ") == said.count("depth: ") == 1
 
 
 def test_where_time_goes_on_the_next_tick_does_not_wait_as_well(waiting):
