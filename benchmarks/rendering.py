@@ -6,11 +6,11 @@ reports each one's median. ``python -m benchmarks.rendering`` prints it as JSON.
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 # mujoco.Renderer takes its OpenGL from what this says when mujoco is first imported.
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -18,7 +18,9 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 import mujoco
 import numpy as np
 
+from benchmarks.command import run_benchmark
 from mujoban_core.camera import FRAME_SIZE
+from mujoban_core.ranges import check_counts, check_positive
 from mujoban_sim.presets import DEFAULT_WORLD, EASED
 from mujoban_sim.scene import SceneCache
 from mujoban_sim.world import World
@@ -27,6 +29,21 @@ from mujoban_sokoban.episodes import Episodes
 BATCH = 64
 THREADS = 2
 DIFFICULTY = 5
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure."""
+
+    seconds: float = 0.25
+    """For each contestant in each round."""
+    rounds: int = 20
+    """How often each one is measured."""
+
+    def __post_init__(self) -> None:
+        """Reject numbers out of their range."""
+        check_positive(self, "seconds")
+        check_counts(self, "rounds")
 
 
 def _make_world(threads: int, name: str = DEFAULT_WORLD) -> World:
@@ -61,18 +78,15 @@ def _rate(function: Callable[[], int], seconds: float) -> float:
     return count / (time.perf_counter() - start)
 
 
-def run(seconds: float = 0.25, rounds: int = 20) -> dict[str, float]:
-    """Measure rendering.
-
-    Args:
-        seconds: time for each contestant in each round.
-        rounds: how often each one is measured.
+def run(options: Options | None = None) -> dict[str, float]:
+    """Measure rendering, by default with the default options.
 
     Returns:
         Rates per second and their ratios to those of MuJoCo's default renderer and of the eased world, whose drawn
         walls are half as high (medians over the rounds), and the machine's load before (1 minute mean of waiting and
         running processes).
     """
+    chosen = options or Options()
     load = os.getloadavg()[0]
     one, two, low = _make_world(1), _make_world(THREADS), _make_world(1, EASED.name)
     rng = np.random.default_rng(0)
@@ -89,11 +103,11 @@ def run(seconds: float = 0.25, rounds: int = 20) -> dict[str, float]:
         "steps_with_camera_per_second_2_threads": step,
     }
     rates: dict[str, list[float]] = {name: [] for name in contestants}
-    for _ in range(rounds):
+    for _ in range(chosen.rounds):
         for name, function in contestants.items():
-            rates[name].append(_rate(function, seconds))
+            rates[name].append(_rate(function, chosen.seconds))
     result = {name: statistics.median(values) for name, values in rates.items()}
-    start, count = time.process_time(), _rate(contestants["frames_per_second"], seconds) * seconds
+    start, count = time.process_time(), _rate(contestants["frames_per_second"], chosen.seconds) * chosen.seconds
     result["frames_per_cpu_second"] = count / (time.process_time() - start)
     others = {"default": "default_renderer_frames_per_second", "low_walls": "frames_per_second_low_walls"}
     for name, other in others.items():
@@ -105,4 +119,4 @@ def run(seconds: float = 0.25, rounds: int = 20) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(), indent=2))
+    run_benchmark("benchmarks.rendering", Options, run, __doc__)

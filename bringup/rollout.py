@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bringup.failure import EpisodeLog
 from bringup.results import EpisodeResult
+from mujoban_core.answers import check_torques
 from mujoban_core.bodies import FIRST_PERSON_CAMERA
 from mujoban_core.camera import FRAME_SIZE, TOP_DOWN_CAMERA
 from mujoban_core.interfaces import GroundTruth, Observation, module_seeds, renew_rows
@@ -119,6 +120,7 @@ def ticks(
         observation = observe(world, rows, camera=camera, looking=looking)
         truth = tell(world, rows, above=above, looking=looking)
         decision, state = policy.step(observation, truth, state)
+        check_torques(decision.torque, (len(rows), world.body.action_size))
         torque[:], issued[:] = 0.0, False
         torque[rows], instruction[rows], issued[rows] = decision.torque, decision.instruction, decision.issued
         world.instruct(instruction, issued)

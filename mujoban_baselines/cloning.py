@@ -49,9 +49,9 @@ class CloningConfig:
     """Settings of cloning."""
 
     rows: int = 16
-    """R."""
+    """R, rows of a batch, each of which reads episodes of its own."""
     window: int = 32
-    """W."""
+    """W, ticks of a batch."""
     rate: float = 5e-4
     """Largest learning rate; it falls to 0 along a half cosine."""
     clip: float = 10.0

@@ -38,9 +38,11 @@ class VTraceTrainingConfig:
     """Robots of whose unrolls each step of the optimiser learns, of all that have played until each has had its turn.
     The later steps' weights are newer than those that played, which importance weights correct for."""
     gamma: float = 0.99
+    """Discount from one decision to the next."""
     rate: float = 3e-4
     """Learning rate; it falls to 0 along a line."""
     clip: float = 40.0
+    """Largest norm of the gradient."""
     auxiliary: float = 0.5
     """Weight of the loss of subgoals (paper D.2), which structured-vtrace alone has."""
     beyond: float = 0.05

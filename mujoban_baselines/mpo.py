@@ -42,11 +42,11 @@ class MPOTrainingConfig:
     """Settings of MPO; where not said otherwise those of Acme."""
 
     window: int = 40
-    """W."""
+    """W, decisions of a window."""
     warm_up: int = 4
-    """b."""
+    """b, decisions at a window's start that bring the memory up to date and teach nothing."""
     windows: int = 10
-    """M."""
+    """M, windows of a batch."""
     replay: int = 32_000
     """Decisions in the replay; each is a frame, and checkpoints carry them."""
     first: int = 8_000
@@ -56,14 +56,17 @@ class MPOTrainingConfig:
     exploration: Exploration = "pink"
     """Noise of the torques that are tried: white noise finds no reward here."""
     n_step: int = 5
+    """n, rewards of a return before the critic's word."""
     samples: int = 20
-    """N."""
+    """N, actions drawn in each state for the E-step."""
     gamma: float = 0.99
+    """Discount from one decision to the next."""
     target_period: int = 20
     """Updates between copies to the target networks; from copy to copy the policy moves by the bounds of the loss."""
     rate: float = 3e-4
     """Learning rate of agent and critic."""
     clip: float = 40.0
+    """Largest norm of the gradient."""
     critic_first: int = 0
     """Updates in which the critic learns alone; an agent that can something already needs it."""
     normalised: int = 500

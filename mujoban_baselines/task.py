@@ -90,7 +90,7 @@ class TaskConfig:
     """Time limit of episodes, the paper's for partially observable agents (C.5); None: the body's, as in evaluation,
     240 s for the ball."""
     robots: int = 64
-    """B, of each actor."""
+    """B, robots that each actor plays at once."""
     body: str = "ball"
     world: str = DEFAULT_WORLD
 

@@ -46,9 +46,9 @@ class DistilConfig:
     """Settings of distillation."""
 
     window: int = 8
-    """W."""
+    """W, ticks of a window."""
     windows: int = 16
-    """M."""
+    """M, windows of a batch."""
     sequence: int = 8
     """Ticks of a sequence in the replay, at least W."""
     replay: int = 64_000
@@ -70,8 +70,11 @@ class DistilConfig:
     warm_up_share: float = 0.01
     """Share of the budget over which the learning rate rises; it falls by a cosine after that."""
     clip: float = 5.0
+    """Largest norm of the gradient."""
     goal_weight: float = 0.5
+    """Weight of what the auxiliary head tells of how far robot and box have to go."""
     kind_weight: float = 0.05
+    """Weight of what it tells of the goal's kind."""
     heading_weight: float = 1.0
     """Weight of what frames show of the heading, for a body that does not feel its own."""
     place_weight: float = 1.0

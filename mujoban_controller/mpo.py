@@ -38,9 +38,9 @@ class MPOTrainingConfig:
     """Settings of MPO in the goal task; where not said otherwise those of Acme."""
 
     window: int = 6
-    """W; the policy learns in the ticks from n on, the critic in as many from the first on."""
+    """W, ticks of a window; the policy learns in the ticks from n on, the critic in as many from the first on."""
     windows: int = 256
-    """M."""
+    """M, windows of a batch."""
     sequence: int = 32
     """Ticks of a sequence in the replay, at least W."""
     replay: int = 500_000
@@ -50,14 +50,17 @@ class MPOTrainingConfig:
     reuse: float = 4.0
     """Times that each step is learned from, on average."""
     n_step: int = 5
+    """n, rewards of a return before the critic's word."""
     samples: int = 20
-    """N, an even number."""
+    """N, actions drawn in each state for the E-step; an even number."""
     gamma: float = 0.98
+    """Discount from one tick to the next."""
     target_period: int = 100
     """Updates between copies to the target networks, of each its own."""
     policy_rate: float = 3e-4
     critic_rate: float = 3e-4
     clip: float = 40.0
+    """Largest norm of the gradient."""
     critic_first: int = 0
     """Updates in which the critic learns alone, of what was played; a policy that is good already needs it."""
     explore: float = 0.0

@@ -36,14 +36,17 @@ class PPOTrainingConfig:
     """Settings of PPO in the goal task."""
 
     length: int = 32
-    """T."""
+    """T, ticks that each robot plays before an update."""
     epochs: int = 4
+    """Times that an update learns from each of them."""
     minibatch: int = 1024
-    """M."""
+    """M, samples of a step of the optimiser."""
     gamma: float = 0.98
+    """Discount from one tick to the next."""
     decay: float = 0.95
     """lambda of the advantages."""
     rate: float = 5e-4
+    """Learning rate at the start."""
     least_rate: float = 3e-5
     largest_rate: float = 2e-3
     target_kl: float = 0.02
@@ -54,6 +57,7 @@ class PPOTrainingConfig:
     bound_weight: float = 0.05
     """Weight of the squared distance by which means lie outside [-1.2, 1.2]."""
     mirror_weight: float = 1.0
+    """Weight of the loss by which the mirrored robot is to do the mirrored thing."""
     normalised: int = 300
     """Updates after which the normalisation of features stays as it is."""
     loss: PPOConfig = field(default_factory=PPOConfig)

@@ -130,7 +130,7 @@ class Options:
     bag_share: float = 0.25
     """Share of the replay's new ticks that comes from bags, if there are any; 1: all, and nothing is simulated."""
     seconds: float | None = None
-    """Stop after so many seconds; resume later."""
+    """Stop after so many seconds and judge what was learned, which takes minutes; resume later."""
     evaluate_every: int = 300_000
     """Environment steps between evaluations on validation levels."""
     evaluation_episodes: int = 64

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_core.answers import checked_instructions
 from mujoban_core.grid import INSTRUCTION_LIMIT, Instruction
 from mujoban_core.trees import map_leaves
 
@@ -280,7 +281,11 @@ class Planner(Module):
     def step(
         self, abstract_state: NDArray[np.float32], terminated: NDArray[np.bool_], state: PlannerState
     ) -> tuple[NDArray[np.int64], PlannerState]:
-        """Return A_t, [B]: a new decision where beta_t or where none is in force yet, else A_{t-1}."""
+        """Return A_t, [B]: a new decision where beta_t or where none is in force yet, else A_{t-1}.
+
+        Raises:
+            ValueError: If what was decided is not one instruction for each robot.
+        """
         due = terminated | (state.instruction < 0)
         rows, others = np.flatnonzero(due), np.flatnonzero(~due)
         if self.thinks and others.size:
@@ -288,9 +293,9 @@ class Planner(Module):
             state = state._replace(memory=put_rows(state.memory, others, memory))
         if rows.size == 0:
             return state.instruction, state
-        decision, memory = self.decide(abstract_state[rows], take_rows(state.memory, rows))
+        decided, memory = self.decide(abstract_state[rows], take_rows(state.memory, rows))
         instruction, sequence = state.instruction.copy(), state.sequence.copy()
-        instruction[rows] = decision
+        instruction[rows] = checked_instructions(decided, rows.size)
         sequence[rows] += 1
         return instruction, PlannerState(put_rows(state.memory, rows, memory), instruction, sequence)
 

@@ -47,6 +47,8 @@ SCRIPTED: Final = "scripted"
 """The scout that goes by a rule."""
 
 _SHIPPED: Final = "weights"
+_UNSHIPPED: Final = (AGENT, SCOUT)
+"""Roles of which no learned one ships."""
 Made = TypeVar("Made")
 
 
@@ -168,8 +170,8 @@ def shipped_weights(role: str, body: str | None = None) -> Path:
     Raises:
         PluginError: If there is no such role, or none of it ship.
     """
-    if role == SCOUT:
-        raise PluginError(f"the {LEARNED} scout: none of its weights ship, expected some (.safetensors)")
+    if role in _UNSHIPPED:
+        raise PluginError(f"the {LEARNED} {role}: none of its weights ship, expected some (.safetensors)")
     _interface(role)
     path = Path(str(_load(role, _SHIPPED)))
     own = path.with_stem(f"{role}_{body}")
@@ -205,7 +207,8 @@ def _load(role: str, name: str) -> object:
     entry = _offered().get(f"{role}.{name}")
     if entry is None:
         names = sorted(n.partition(".")[2] for n in _offered() if n.startswith(f"{role}."))
-        known = ", ".join(n for n in names if n != _SHIPPED) or "none is installed: run make setup"
+        unnamed = (_SHIPPED, LEARNED) if role in _UNSHIPPED else (_SHIPPED,)
+        known = ", ".join(n for n in names if n not in unnamed) or "none is installed: run make setup"
         expected = f"package.module:Class, weights (.safetensors) or one of {known}"
         raise PluginError(f"no {role} is named {name!r}: expected {expected}")
     try:

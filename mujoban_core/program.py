@@ -137,11 +137,19 @@ def read_options(
     """
     import tyro
 
+    if isinstance(options, Mapping):
+        _check_subcommand(sys.argv[1:] if command_line is None else command_line, options)
     read: Any = tyro.extras.subcommand_cli_from_dict if isinstance(options, Mapping) else tyro.cli
     with _errors_in_one_line("what --help lists"):
         return read(
             options, args=command_line, prog=prog, description=description, config=(tyro.conf.FlagCreatePairsOff,)
         )
+
+
+def _check_subcommand(words: Sequence[str], known: Mapping[str, Any]) -> None:
+    """Raise a ValueError if what stands in the place of a subcommand is none."""
+    if words and not words[0].startswith("-") and words[0] not in known:
+        raise ValueError(f"{words[0]}: expected one of {', '.join(known)}")
 
 
 def read_changes(settings: OptionsT, words: Sequence[str], expected: str) -> OptionsT:

@@ -8,7 +8,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoban_core.answers import check_probabilities
 from mujoban_core.bodies import FIRST_PERSON_CAMERA
+from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.interfaces import (
     NO_INSTRUCTION,
     Controller,
@@ -95,10 +97,15 @@ class SensePlanAct:
         """Return the decision of tick t and the next state; `truth` reaches privileged modules only.
 
         What is seen or estimated each module gets as arrays of its own, which it may write into.
+
+        Raises:
+            ValueError: If a module answers by numbers that its role does not have.
         """
+        robots = len(obs.pose)
         estimate, estimator_state = self.estimator.step(
             EstimatorInput(obs.frame.copy(), obs.pose.copy(), self._truth_for("estimator", truth)), state.estimator
         )
+        check_probabilities("estimator", estimate, (robots, GRID_SIZE, GRID_SIZE, len(CHANNELS)))
         previous = np.where(state.planner.instruction < 0, NO_INSTRUCTION, state.planner.instruction)
         beta, termination_state = self.termination.step(
             TerminationInput(
@@ -106,6 +113,7 @@ class SensePlanAct:
             ),
             state.termination,
         )
+        check_probabilities("termination", beta.probability, (robots,))
         instruction, planner_state = self.planner.step(estimate.copy(), beta.terminated, state.planner)
         torque, controller_state = self.controller.step(
             ControllerInput(

@@ -42,7 +42,7 @@ class _Command(ABC):
     """What all trainings have in common."""
 
     seconds: float | None = None
-    """Stop after so many seconds; a later call resumes."""
+    """Stop after so many seconds and judge what was learned, which takes minutes; a later call resumes."""
     evaluate_every: float = 300.0
     """Seconds between evaluations on held-out levels."""
     evaluate_samples: float = math.inf

@@ -164,9 +164,13 @@ def _costs(curves: Mapping[str, Curve], every: float) -> list[float]:
 
 
 def _table(unit: str, costs: Sequence[float], curves: Mapping[str, Curve], *, rate: bool) -> str:
-    """Return a row for each cost at which a curve has a value, with a column for each curve."""
+    """Return a row for each cost at which a curve has a value, with a column for each curve; or that there is none."""
     rows = [[f"{cost:,.12g}", *(_value_at(curve, cost, rate=rate) for curve in curves.values())] for cost in costs]
-    lines = [[unit, *curves], ["---:"] * (len(curves) + 1), *(row for row in rows if any(row[1:]))]
+    shown = [row for row in rows if any(row[1:])]
+    if not shown:
+        option = f"--every-{unit.split()[-1]}"
+        return f"No run has evaluations before and after a row of {unit}: {option} takes smaller steps."
+    lines = [[unit, *curves], ["---:"] * (len(curves) + 1), *shown]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 

@@ -88,6 +88,11 @@ class Learner(_Part, Generic[BatchT]):
         """
         return {}
 
+    @property
+    def judges(self) -> bool:
+        """Whether `evaluate` is its own."""
+        return type(self).evaluate is not Learner.evaluate
+
     def restore_best(self, state: State) -> None:
         """Take over the part `best` of what `state` returned: all that a light copy keeps of it."""
 
@@ -232,6 +237,8 @@ class Trainer(Generic[BatchT]):
                     self.learner.export(self.directory, self._told or self._told_now())
                 else:
                     if not stop.requested and self._evaluated != self.progress.updates:
+                        if self.learner.judges:
+                            say(f"{self.directory.path}: judging what was learned; Ctrl-C puts it off")
                         self._evaluate(log, stop)
                     self.save()
             path, done = self.directory.path, f"after {readable(self.progress.samples)} samples"

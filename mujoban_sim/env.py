@@ -145,6 +145,10 @@ class MujobanEnv(gymnasium.Env[Observations, NDArray[np.float32]]):
     ## Info
     ``reset``: ``seed``, and ``level`` as a text. ``step``: ``solved`` and ``boxes_on_target``.
 
+    ## Rendering
+    ``render_mode="rgb_array"``: `render` returns a view from above, uint8 (256, 256, 3); Gymnasium makes
+    ``"rgb_array_list"`` of it, and with pygame installed ``"human"``, a window. The robot's own view is ``frame``.
+
     ## Arguments
     ``gymnasium.make("Mujoban-v0", difficulty=5, level_file=None, observations="default", body="ball",
     world=DEFAULT_WORLD, time_limit=None, render_mode=None)``. `import mujoban_sim` registers the environment.

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Sequence
+from numbers import Integral
 from typing import Final
 
 import numpy as np
@@ -222,7 +223,7 @@ def _generate(
 
 def check_difficulty(difficulty: int) -> None:
     """Raise a `ValueError` unless there are levels of this difficulty."""
-    if difficulty not in DIFFICULTIES:
+    if difficulty not in DIFFICULTIES or not isinstance(difficulty, Integral):
         raise ValueError(f"unknown difficulty {difficulty!r}: expected one of {', '.join(map(str, DIFFICULTIES))}")
 
 

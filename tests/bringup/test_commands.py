@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -84,6 +85,16 @@ def test_one_command_trains_each_module_and_names_what_it_does_not_know(capfd, m
     assert err.startswith("command: error: unrecognized options: --bogus") and err.count("\n") == 1
     assert run(train, module, "--help") == 0
     assert f"usage: train.py {module}" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "trained",
+    [["controller"], ["estimator"], *(["baselines", m] for m in ("monolithic-mpo", "structured-vtrace", "clone"))],
+    ids=" ".join,
+)
+def test_help_explains_by_more_than_a_letter_of_the_code(capfd, trained):
+    assert run(train, *trained, "--help") == 0
+    assert not re.findall(r"(--\S+) +\S+\s+[│ ]*[A-Za-z]\. ", capfd.readouterr().out)
 
 
 def test_what_cannot_be_trained_is_one_line(capfd):

@@ -1,12 +1,13 @@
 """Which module plays; those of a user's own that cannot are named with what was expected of them."""
 
 import re
+from functools import partial
 
 import pytest
 
 import mujoban_controller
 from bringup.command import Choice, Stack
-from mujoban_core.plugins import ORACLE, PluginError, load_module, shipped_weights
+from mujoban_core.plugins import ORACLE, PluginError, load_module, load_scout, shipped_weights
 
 
 @pytest.mark.parametrize(
@@ -24,6 +25,18 @@ def test_a_class_that_cannot_be_made_without_arguments_is_named(source, message)
 def test_what_names_no_module_is_told_all_that_would():
     with pytest.raises(PluginError, match=r"planner': .*Class, weights \(\.safetensors\) or one of"):
         Choice.parse("planner", "runs/plans/planner").load()
+
+
+@pytest.mark.parametrize("role", ["agent", "scout"])
+def test_what_learned_but_does_not_ship_needs_weights(role):
+    with pytest.raises(PluginError, match=rf"the learned {role}: none of its weights ship, expected some"):
+        shipped_weights(role)
+
+
+@pytest.mark.parametrize(("load", "names"), [(partial(load_module, "agent"), "random"), (load_scout, "scripted")])
+def test_learned_is_no_name_for_what_does_not_ship(load, names):
+    with pytest.raises(PluginError, match=rf"is named 'nobody': .*or one of {names}$"):
+        load("nobody")
 
 
 def test_a_module_of_which_an_import_fails_is_named(tmp_path, monkeypatch):

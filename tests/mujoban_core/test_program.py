@@ -88,6 +88,15 @@ def test_what_an_option_of_a_subcommand_rejects_is_said_in_its_own_words():
         read_options({"one": Options, "two": Options}, ["one", "--settings.reuse", "0"], "program")
 
 
+def test_an_unknown_subcommand_is_told_all_that_there_are():
+    @dataclass
+    class Options:
+        steps: int = 8
+
+    with pytest.raises(ValueError, match=r"^three: expected one of one, two$"):
+        read_options({"one": Options, "two": Options}, ["three", "--steps", "4"], "program")
+
+
 def test_what_all_options_together_reject_begins_with_the_option():
     @dataclass
     class Options:

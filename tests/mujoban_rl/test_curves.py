@@ -40,6 +40,12 @@ def test_success_is_drawn_of_a_run_whatever_it_trains(run, capsys):
     assert "| 200,000 | 50.0 % |" in lines and "| 30 | 75.0 % |" in lines
 
 
+def test_a_run_too_short_for_a_row_is_told_how_to_get_one(run, capsys):
+    lines, _ = shown(capsys, run, "--every-samples", "500000")
+    assert lines[2].startswith("No run has evaluations before and after a row of samples: --every-samples")
+    assert "| 30 | 75.0 % |" in lines
+
+
 def test_another_metric_is_drawn_in_its_own_unit(run, capsys):
     lines, _ = shown(capsys, run, "--metric", "evaluation/steps", "--names", "ant", "--every-minutes", "15")
     assert lines[0] == "Steps, linear between evaluations"

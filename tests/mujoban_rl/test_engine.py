@@ -209,6 +209,25 @@ def test_a_run_that_ends_says_how_and_where_its_weights_are(tmp_path, capsys):
     assert said().endswith("run: complete after 200 samples; nothing is left to do")
 
 
+def test_a_bit_that_ends_says_before_it_judges_what_it_learned(tmp_path, capsys):
+    run = trainer(tmp_path / "run")
+    judge, said = run.learner.evaluate, []
+
+    def evaluate():
+        said.extend(capsys.readouterr().err.splitlines())
+        return judge()
+
+    run.learner.evaluate = evaluate
+    run.run(limit_updates=3)
+    assert said[-1].endswith("run: judging what was learned; Ctrl-C puts it off")
+
+
+def test_a_learner_that_judges_nothing_announces_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.delattr(Regression, "evaluate")
+    trainer(tmp_path).run(limit_updates=3)
+    assert "judging" not in capsys.readouterr().err
+
+
 def test_what_came_since_the_last_line_is_logged_where_a_bit_ends(tmp_path):
     cadence = Cadence(log_updates=5)
     for updates in (7, 10):

@@ -1,4 +1,5 @@
 import dataclasses
+import math
 import subprocess
 import sys
 
@@ -271,8 +272,9 @@ def test_bad_arguments_are_named():
         World(0)
     with pytest.raises(ValueError, match="unknown body 'car'"):
         World(1, body="car")
-    with pytest.raises(ValueError, match="time_limit"):
-        World(1, time_limit=0)
+    for limit in (0, math.nan):
+        with pytest.raises(ValueError, match=f"time_limit is {limit}: expected at least 1 step"):
+            World(1, time_limit=limit)
     world = World(2, max_boxes=1)
     with pytest.raises(ValueError, match=r"2 boxes.*max_boxes = 1"):
         world.reset([0], [EpisodeSpec(ROOM, 0)])

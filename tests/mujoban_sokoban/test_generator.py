@@ -121,7 +121,7 @@ def test_floor_is_one_room():
         assert len(reached) == (~level.wall).sum()
 
 
-@pytest.mark.parametrize("difficulty", [0, 6, -1])
+@pytest.mark.parametrize("difficulty", [0, 6, -1, 5.0])
 def test_an_unknown_difficulty_is_refused(difficulty):
     with pytest.raises(ValueError, match=rf"unknown difficulty {difficulty}: expected one of 1, 2, 3, 4, 5"):
         generate_level(difficulty, 0)

@@ -1,0 +1,100 @@
+"""Compare two reports of the same levels: `python -m bringup.compare FIRST.json SECOND.json`.
+
+Reports are what `bringup/evaluate.py --json` writes. Each level that both played is a pair: what tells the two apart
+are the levels that only one of them solved. So the interval is narrower than those of the two rates.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    from mujoban_core.early import end_at_once
+
+    end_at_once()
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import tyro
+
+from bringup.results import SEEDS_SHOWN
+from mujoban_core.program import read_options, run_command
+from mujoban_core.stats import paired_difference, sign_test
+
+PROG: Final = "bringup.compare"
+_LEVELS: Final = ("difficulty", "level_file_sha256")
+"""Entries of a report's `played` that make a seed another level."""
+_WHERE: Final = ("seed", "level_file")
+"""Those that say where its levels are from."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compare two reports."""
+
+    first: Annotated[Path, tyro.conf.Positional]
+    """Report of the one."""
+    second: Annotated[Path, tyro.conf.Positional]
+    """Report of the other, on the same levels."""
+
+
+def compare(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    """Return in a few lines whether the second report is of a better player than the first.
+
+    Raises:
+        ValueError: If they have no level in common.
+    """
+    played = [report.get("played") or {} for report in (first, second)]
+    solved = [{entry["seed"]: bool(entry["solved"]) for entry in report["episodes"]} for report in (first, second)]
+    same = all(played[0].get(key) == played[1].get(key) for key in _LEVELS)
+    levels = sorted(solved[0].keys() & solved[1].keys()) if same else []
+    if not levels:
+        raise ValueError("the reports have no level in common: expected two of the same difficulty or file, and seeds")
+    alone = [[seed for seed in levels if solved[a][seed] and not solved[1 - a][seed]] for a in (0, 1)]
+    lost, won, n = len(alone[0]), len(alone[1]), len(levels)
+    mean, low, high = (100 * value for value in paired_difference(lost, won, n))
+    rates = [f"{100 * sum(one[seed] for seed in levels) / n:.1f} %" for one in solved]
+    return [
+        f"{n} levels in common: the first solved {rates[0]}, the second {rates[1]}",
+        f"the first alone solved {_listed(alone[0])}, the second alone {_listed(alone[1])}",
+        f"the second less the first: {mean:+.1f} points (95 % interval {low:+.1f} to {high:+.1f}); sign test p = "
+        f"{sign_test(lost, won):.2g}",
+        *_otherwise(*played),
+    ]
+
+
+def _listed(seeds: Sequence[int]) -> str:
+    if not seeds:
+        return "0"
+    more = f" and {len(seeds) - SEEDS_SHOWN} more" if len(seeds) > SEEDS_SHOWN else ""
+    return f"{len(seeds)} (seeds {', '.join(map(str, seeds[:SEEDS_SHOWN]))}{more})"
+
+
+def _otherwise(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
+    """Return a line that names what was played otherwise, if something was."""
+    keys = sorted((first.keys() | second.keys()) - {*_LEVELS, *_WHERE})
+    apart = [f"{key} {first.get(key)} and {second.get(key)}" for key in keys if first.get(key) != second.get(key)]
+    return [f"played otherwise: {', '.join(apart)}"] if apart else []
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        report = json.loads(path.read_text())
+        if all({"seed", "solved"} <= entry.keys() for entry in report["episodes"]):
+            return report
+    except (ValueError, KeyError, TypeError, AttributeError):
+        pass
+    raise ValueError(f"{path}: no report with its episodes, expected what bringup/evaluate.py --json writes")
+
+
+def main(command_line: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    options = read_options(Options, command_line, PROG, __doc__)
+    print(*compare(_read(options.first), _read(options.second)), sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(PROG, main)

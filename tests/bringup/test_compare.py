@@ -1,0 +1,60 @@
+"""Two reports of the same levels, compared level by level."""
+
+import json
+import re
+
+import pytest
+
+from bringup import compare
+from mujoban_core.stats import paired_difference, sign_test
+
+
+def report(path, solved, first=0, **played):
+    episodes = [{"seed": first + i, "solved": bool(s)} for i, s in enumerate(solved)]
+    path.write_text(json.dumps({"episodes": episodes, "played": {"difficulty": 3, "seed": first, **played}}))
+    return str(path)
+
+
+def said(capsys, *reports):
+    assert compare.main(reports) == 0
+    return capsys.readouterr().out.splitlines()
+
+
+def test_levels_that_only_one_solved_tell_two_reports_apart(tmp_path, capsys):
+    ours = report(tmp_path / "a.json", [1, 1, 0, 0, 1, 1])
+    theirs = report(tmp_path / "b.json", [1, 1, 1, 1, 0])
+    common, alone, difference = said(capsys, ours, theirs)
+    assert common == "5 levels in common: the first solved 60.0 %, the second 80.0 %"
+    assert alone == "the first alone solved 1 (seeds 4), the second alone 2 (seeds 2, 3)"
+    expected = r"the second less the first: \+20\.0 points \(95 % interval -.* to \+.*\); sign test p = 1"
+    assert re.fullmatch(expected, difference)
+
+
+def test_what_was_played_otherwise_is_named(tmp_path, capsys):
+    ours = report(tmp_path / "a.json", [1, 0], look_ahead=400)
+    theirs = report(tmp_path / "b.json", [1, 0], first=1, look_ahead=0)
+    assert said(capsys, ours, theirs)[-1] == "played otherwise: look_ahead 400 and 0"
+
+
+def test_reports_of_other_levels_are_refused(tmp_path):
+    ours = report(tmp_path / "a.json", [1, 0])
+    for other in ({"difficulty": 4}, {"first": 100}, {"level_file_sha256": "0123"}):
+        with pytest.raises(ValueError, match="no level in common"):
+            compare.main([ours, report(tmp_path / "b.json", [1, 0], **other)])
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"episodes": [3]}', '{"episodes": [{"seed": 1}]}'])
+def test_what_is_no_report_is_named(tmp_path, content):
+    (other := tmp_path / "other.json").write_text(content)
+    with pytest.raises(ValueError, match=r"other\.json: no report with its episodes"):
+        compare.main([report(tmp_path / "a.json", [1]), str(other)])
+
+
+def test_more_evidence_narrows_the_interval_and_lowers_the_chance():
+    few, many = paired_difference(2, 6, 40), paired_difference(20, 60, 400)
+    assert few[0] == many[0] == pytest.approx(0.1)
+    assert few[1] < 0.0 < many[1] < many[0] < many[2] < few[2]
+    assert sign_test(20, 60) < 1e-4 < 0.05 < sign_test(2, 6)
+    assert sign_test(1, 5) == sign_test(5, 1) == pytest.approx(2 * 7 / 64)
+    assert sign_test(3, 3) == sign_test(0, 0) == 1.0
+    assert paired_difference(0, 0, 10)[1] < 0.0 < paired_difference(0, 0, 10)[2]
