@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mujoban_core.grid import Instruction
+
 
 def check_probabilities(role: str, values: NDArray[np.floating], shape: tuple[int, ...]) -> None:
     """Refuse what a module gives in the place of probabilities of a shape.
@@ -27,12 +29,18 @@ def checked_instructions(decision: ArrayLike, robots: int) -> NDArray[np.int64]:
     """Return what a planner decides as an array, [M].
 
     Raises:
-        ValueError: If it is not one whole number for each robot.
+        ValueError: If it is not one value of `grid.Instruction` for each robot.
     """
     instructions = np.asarray(decision)
     _check_shape("the planner decides instructions", instructions.shape, (robots,))
     if not np.issubdtype(instructions.dtype, np.integer):
         raise ValueError(f"the planner decides {instructions.dtype} numbers: expected values of grid.Instruction")
+    # A learned controller would look for it in a table of these, before the world could refuse it.
+    if robots and not (instructions.min() >= 0 and instructions.max() < len(Instruction)):
+        raise ValueError(
+            f"the planner decides {instructions.min()} to {instructions.max()}: expected values of grid.Instruction, "
+            f"from 0 to {len(Instruction) - 1}"
+        )
     return instructions
 
 

@@ -41,6 +41,8 @@ def play(policy):
         ("termination", lambda p: p + np.nan, "termination gives numbers from"),
         ("termination", lambda p: np.stack([p, p]), r"termination.*\(2, 2\): expected \(2,\)"),
         ("planner", lambda a: a + 0.7, "planner decides float64 numbers: expected values of grid.Instruction"),
+        ("planner", lambda a: a * 0 + 9, "planner decides 9 to 9: expected values of grid.Instruction, from 0 to 4"),
+        ("planner", lambda a: a * 0 - 1, "planner decides -1 to -1: expected values of grid.Instruction"),
         ("planner", lambda a: a[0], r"planner.*\(\): expected \(2,\)"),
         ("controller", lambda a: a[0], r"torques of shape \(2,\): expected \(2, 2\)"),
     ],
