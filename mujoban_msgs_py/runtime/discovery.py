@@ -76,7 +76,8 @@ def lock_domain(domain: int) -> socket.socket | None:
 
 def held_domains() -> list[int]:
     """Return the ROS domains that graphs of this machine hold."""
-    return sorted({int(domain) for domain in re.findall(rf"@{_LOCK}(\d+)", Path("/proc/net/unix").read_text())})
+    held = re.findall(rf"@{_LOCK}(\d+)$", "\n".join(_lines(Path("/proc/net/unix"))), re.MULTILINE)
+    return sorted({int(domain) for domain in held})
 
 
 def is_alone(domain: int) -> bool:
@@ -94,5 +95,5 @@ def is_alone(domain: int) -> bool:
 
 
 def _lines(table: Path) -> list[str]:
-    """Return the lines of a table of sockets, none where the kernel has none."""
-    return table.read_text().splitlines()[1:] if table.exists() else []
+    """Return the lines of a table of sockets, none where the kernel has none; names in it may be any bytes."""
+    return table.read_text(errors="replace").splitlines()[1:] if table.exists() else []

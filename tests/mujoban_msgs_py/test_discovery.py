@@ -2,6 +2,7 @@
 
 import os
 import re
+import socket
 import subprocess
 import sys
 
@@ -73,6 +74,12 @@ def test_who_is_alone_in_a_domain_knows_it_and_where_graphs_run(monkeypatch):
         finally:
             child.kill()
     assert met.stdout == "/lonely\n" and met.stderr == ""
+
+
+def test_sockets_of_others_may_have_names_that_are_no_text():
+    with socket.socket(socket.AF_UNIX) as other, discovery.lock_domain(DOMAIN + 100):
+        other.bind(b"\0\xff\xfe" + str(os.getpid()).encode())
+        assert DOMAIN + 100 in discovery.held_domains()
 
 
 @pytest.mark.parametrize(("variable", "value"), [(RANGE, "SUBNET"), ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")])
