@@ -19,7 +19,7 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from bringup.results import SEEDS_SHOWN
+from bringup.results import counted
 from mujoban_core.program import read_options, run_command
 from mujoban_core.stats import paired_difference, sign_test
 
@@ -46,7 +46,7 @@ def compare(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     Raises:
         ValueError: If they have no level in common.
     """
-    played = [report.get("played") or {} for report in (first, second)]
+    played = [report["played"] for report in (first, second)]
     solved = [{entry["seed"]: bool(entry["solved"]) for entry in report["episodes"]} for report in (first, second)]
     same = all(played[0].get(key) == played[1].get(key) for key in _LEVELS)
     levels = sorted(solved[0].keys() & solved[1].keys()) if same else []
@@ -58,18 +58,11 @@ def compare(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     rates = [f"{100 * sum(one[seed] for seed in levels) / n:.1f} %" for one in solved]
     return [
         f"{n} levels in common: the first solved {rates[0]}, the second {rates[1]}",
-        f"the first alone solved {_listed(alone[0])}, the second alone {_listed(alone[1])}",
+        f"the first alone solved {counted(alone[0])}, the second alone {counted(alone[1])}",
         f"the second less the first: {mean:+.1f} points (95 % interval {low:+.1f} to {high:+.1f}); sign test p = "
         f"{sign_test(lost, won):.2g}",
         *_otherwise(*played),
     ]
-
-
-def _listed(seeds: Sequence[int]) -> str:
-    if not seeds:
-        return "0"
-    more = f" and {len(seeds) - SEEDS_SHOWN} more" if len(seeds) > SEEDS_SHOWN else ""
-    return f"{len(seeds)} (seeds {', '.join(map(str, seeds[:SEEDS_SHOWN]))}{more})"
 
 
 def _otherwise(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
@@ -82,7 +75,8 @@ def _otherwise(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]
 def _read(path: Path) -> dict[str, Any]:
     try:
         report = json.loads(path.read_text())
-        if all({"seed", "solved"} <= entry.keys() for entry in report["episodes"]):
+        complete = all({"seed", "solved"} <= entry.keys() for entry in report["episodes"])
+        if complete and isinstance(report["played"], dict):  # else nobody knows whether two have the same levels
             return report
     except (ValueError, KeyError, TypeError, AttributeError):
         pass

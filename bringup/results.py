@@ -92,8 +92,8 @@ def report(results: Sequence[EpisodeResult], weights: Mapping[str, str], **extra
 
 _DIGITS = 12
 """Of a digest that a summary shows: enough to tell weights apart, in a terminal of 60 columns."""
-SEEDS_SHOWN = 12
-"""Seeds of lost episodes that a summary names for each cause."""
+_SEEDS_SHOWN = 12
+"""Seeds of episodes that a text names, of each kind."""
 
 
 def summary(content: Mapping[str, Any]) -> list[str]:
@@ -110,12 +110,17 @@ def summary(content: Mapping[str, Any]) -> list[str]:
         lines[0] += f", {content['ticks_per_second']:.0f} ticks/s"
     if "interrupted" in content:
         lines.append(f"interrupted: {content['interrupted']} episodes were asked for, and long ones are missing most")
-    for cause, count in content["failures"].items():
-        seeds = [str(entry["seed"]) for entry in episodes if entry["failure"] == cause]
-        more = f" and {count - SEEDS_SHOWN} more" if count > SEEDS_SHOWN else ""
-        lines.append(f"lost by {cause}: {count} (seeds {', '.join(seeds[:SEEDS_SHOWN])}{more})")
+    for cause in content["failures"]:
+        seeds = [entry["seed"] for entry in episodes if entry["failure"] == cause]
+        lines.append(f"lost by {cause}: {counted(seeds)}")
     lines += told(content["weights"])
     return lines + [f"{event}: {count}" for event, count in sorted(content.get("counts", {}).items())]
+
+
+def counted(seeds: Sequence[int]) -> str:
+    """Return how many seeds there are, and in brackets the first `_SEEDS_SHOWN` of them."""
+    more = f" and {len(seeds) - _SEEDS_SHOWN} more" if len(seeds) > _SEEDS_SHOWN else ""
+    return f"{len(seeds)} (seeds {', '.join(map(str, seeds[:_SEEDS_SHOWN]))}{more})" if seeds else "0"
 
 
 def told(weights: Mapping[str, str]) -> list[str]:

@@ -43,7 +43,11 @@ def test_reports_of_other_levels_are_refused(tmp_path):
             compare.main([ours, report(tmp_path / "b.json", [1, 0], **other)])
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"episodes": [3]}', '{"episodes": [{"seed": 1}]}'])
+NO_SOLVED = '{"episodes": [{"seed": 1}], "played": {}}'
+NO_GAME = '{"episodes": [{"seed": 1, "solved": true}]}'
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"episodes": [3]}', NO_SOLVED, NO_GAME])
 def test_what_is_no_report_is_named(tmp_path, content):
     (other := tmp_path / "other.json").write_text(content)
     with pytest.raises(ValueError, match=r"other\.json: no report with its episodes"):
