@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Final
+
+NORMAL_95: Final = 1.959963984540054
+"""Standard normal quantile of an interval with 95 % coverage, on both sides."""
 
 
-def wilson_interval(successes: int, n: int, z: float = 1.959963984540054) -> tuple[float, float]:
+def wilson_interval(successes: int, n: int, z: float = NORMAL_95) -> tuple[float, float]:
     """Return the Wilson score interval of a success rate (Wilson 1927).
 
     Args:
@@ -56,7 +60,7 @@ def paired_difference(lost: int, won: int, n: int) -> tuple[float, float, float]
     # Half a trial more in each cell of the table of both outcomes, so that the interval of no difference is no point.
     total, b, c = n + 2.0, lost + 0.5, won + 0.5
     centre = (c - b) / total
-    half = 1.959963984540054 * math.sqrt(b + c - (c - b) ** 2 / total) / total
+    half = NORMAL_95 * math.sqrt(b + c - (c - b) ** 2 / total) / total
     return (won - lost) / n, max(-1.0, centre - half), min(1.0, centre + half)
 
 

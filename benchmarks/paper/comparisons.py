@@ -14,15 +14,13 @@ from typing import Any, Final, NamedTuple
 
 from benchmarks.paper.baselines import AGAIN, BASELINES, HOURS, MODULAR, Baseline, points_of, steps
 from benchmarks.paper.runs import load
-from mujoban_core.stats import wilson_interval
+from mujoban_core.stats import NORMAL_95, wilson_interval
 from mujoban_sokoban.generator import generate_level
 
 _FLOOR: Final = "untrained"
 """The row that the others are compared with."""
 _EASIEST: Final = 1
 """The difficulty whose levels come again, and the one at which agents differ."""
-_Z: Final = 1.959963984540054
-"""Of 95 %."""
 
 
 class Difference(NamedTuple):
@@ -44,7 +42,7 @@ def interval(episodes: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
     simple = rate * (1.0 - rate) / n
     # Where all end alike nothing is known of how much copies differ: as if they did not.
     effect = max(1.0, _variance(shares.values()) / simple) if simple else n / len(shares)
-    return wilson_interval(solved, n, _Z * math.sqrt(effect))
+    return wilson_interval(solved, n, NORMAL_95 * math.sqrt(effect))
 
 
 def difference(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[str, Any]]) -> Difference:
@@ -57,7 +55,7 @@ def difference(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[str,
     ours, theirs = _shares(first), _shares(second)
     mean = sum(e["solved"] for e in first) / len(first) - sum(e["solved"] for e in second) / len(second)
     apart = [ours.get(level, 0.0) - theirs.get(level, 0.0) for level in ours.keys() | theirs.keys()]
-    half = _Z * math.sqrt(_variance(apart))
+    half = NORMAL_95 * math.sqrt(_variance(apart))
     return Difference(mean, mean - half, mean + half)
 
 

@@ -6,7 +6,6 @@ import re
 import pytest
 
 from bringup import compare
-from mujoban_core.stats import paired_difference, sign_test
 
 
 def report(path, solved, first=0, **played):
@@ -52,13 +51,3 @@ def test_what_is_no_report_is_named(tmp_path, content):
     (other := tmp_path / "other.json").write_text(content)
     with pytest.raises(ValueError, match=r"other\.json: no report with its episodes"):
         compare.main([report(tmp_path / "a.json", [1]), str(other)])
-
-
-def test_more_evidence_narrows_the_interval_and_lowers_the_chance():
-    few, many = paired_difference(2, 6, 40), paired_difference(20, 60, 400)
-    assert few[0] == many[0] == pytest.approx(0.1)
-    assert few[1] < 0.0 < many[1] < many[0] < many[2] < few[2]
-    assert sign_test(20, 60) < 1e-4 < 0.05 < sign_test(2, 6)
-    assert sign_test(1, 5) == sign_test(5, 1) == pytest.approx(2 * 7 / 64)
-    assert sign_test(3, 3) == sign_test(0, 0) == 1.0
-    assert paired_difference(0, 0, 10)[1] < 0.0 < paired_difference(0, 0, 10)[2]

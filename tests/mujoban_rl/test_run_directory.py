@@ -12,7 +12,6 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import nn
 
-from mujoban_core.stats import wilson_interval
 from mujoban_rl import run_directory
 from mujoban_rl.limits import NaNGuard, TimeLimit
 from mujoban_rl.run_directory import RunDirectory, RunError, copy_light
@@ -299,16 +298,3 @@ def test_nan_guard_refuses_and_gives_up():
 
 def test_a_time_limit_ends_when_its_time_is_up():
     assert TimeLimit(0.0).reached and not TimeLimit(None).reached
-
-
-@pytest.mark.parametrize(("successes", "n"), [(0, 0), (0, 20), (20, 20), (950, 1000)])
-def test_wilson_interval_holds_the_rate(successes, n):
-    low, high = wilson_interval(successes, n)
-    assert 0.0 <= low <= (successes / n if n else 0.0) <= high <= 1.0
-
-
-def test_wilson_interval_matches_the_published_formula_and_rejects_nonsense():
-    # 81/263, 95 %: Newcombe 1998, table I, method 3
-    assert wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
-    with pytest.raises(ValueError, match="successes"):
-        wilson_interval(3, 2)
