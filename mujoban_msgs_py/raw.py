@@ -13,7 +13,7 @@ from typing import Any
 
 from rclpy.serialization import deserialize_message
 
-from mujoban_msgs_py.topics import Message
+from mujoban_msgs_py.topics import Message, type_name
 
 _LITTLE_ENDIAN = 1
 _ENCAPSULATION = 4
@@ -55,8 +55,7 @@ def read(message: bytes, kind: type[Message], decode: Callable[[Any], Any] | Non
             raise RuntimeError
         content = deserialize_message(message, kind)
     except RuntimeError:
-        name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
-        raise ValueError(f"its {len(message)} bytes are no serialised {name}") from None
+        raise ValueError(f"its {len(message)} bytes are no serialised {type_name(kind)}") from None
     return content if decode is None else decode(content)
 
 

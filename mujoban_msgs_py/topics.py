@@ -50,6 +50,12 @@ class Message(Protocol):
         ...
 
 
+def type_name(kind: type[Any]) -> str:
+    """Return the type of a message or service as ROS writes it, such as `sensor_msgs/msg/Image`."""
+    package, family = kind.__module__.split(".")[:2]
+    return f"{package}/{family}/{kind.__name__}"
+
+
 @dataclass(frozen=True, eq=False)
 class Topic:
     """A topic of the graph."""
@@ -62,7 +68,7 @@ class Topic:
     @property
     def type_name(self) -> str:
         """The type as ROS writes it, such as `sensor_msgs/msg/Image`."""
-        return f"{self.type.__module__.split('.')[0]}/msg/{self.type.__name__}"
+        return type_name(self.type)
 
     @property
     def depth(self) -> int:

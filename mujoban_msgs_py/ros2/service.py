@@ -18,6 +18,7 @@ from mujoban_msgs_py.ros2.session import (
     is_hidden,
 )
 from mujoban_msgs_py.ros2.verbs import Verbs
+from mujoban_msgs_py.topics import type_name
 
 
 def add_verbs(commands: Verbs) -> None:
@@ -71,7 +72,11 @@ def _types(session: Session, name: str) -> list[str]:
 
 
 def _await(session: Session, client: Client, kind: str) -> None:
-    """Wait for a service; one of another type is a CommandError at once."""
+    """Wait for a service of a type.
+
+    Raises:
+        CommandError: At once if it is of another type, or if there is none within the time for discovery.
+    """
     name = client.srv_name
 
     def others() -> set[str]:
@@ -95,7 +100,7 @@ def call(options: argparse.Namespace) -> int:
         client = session.node.create_client(kind, name)
         if not client.service_is_ready():
             print("waiting for service to become available...", flush=True)
-            _await(session, client, f"{kind.__module__.partition('.')[0]}/srv/{kind.__name__}")
+            _await(session, client, type_name(kind))
         while True:
             request = kind.Request()
             fill(request, values, session.node.get_clock().now().to_msg())
