@@ -18,11 +18,16 @@ def check_probabilities(role: str, values: NDArray[np.floating], shape: tuple[in
         ValueError: If they are of another shape, or not from 0 to 1.
     """
     _check_shape(f"the {role} gives probabilities", values.shape, shape)
-    # Written so that NaN fails as well.
-    if values.size and not (values.min() >= 0.0 and values.max() <= 1.0):
+    if not are_probabilities(values):
         raise ValueError(
             f"the {role} gives numbers from {values.min()} to {values.max()}: expected probabilities, from 0 to 1"
         )
+
+
+def are_probabilities(values: NDArray[np.floating]) -> bool:
+    """Return whether all numbers of an array of any shape are from 0 to 1, which NaN is not."""
+    # Written so that NaN fails as well.
+    return not values.size or bool(values.min() >= 0.0 and values.max() <= 1.0)
 
 
 def checked_instructions(decision: ArrayLike, robots: int) -> NDArray[np.int64]:

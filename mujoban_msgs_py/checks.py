@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mujoban_core.answers import are_probabilities
 from mujoban_core.grid import Instruction as Direction
 
 _LARGEST: Final[dict[type[np.floating[Any]], float]] = {t: float(np.finfo(t).max) for t in (np.float32, np.float64)}
@@ -36,8 +37,7 @@ def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
 
 def check_probabilities(what: str, values: NDArray[np.floating[Any]]) -> None:
     """Refuse an array of numbers that are no probabilities."""
-    # Written so that NaN fails as well.
-    if values.size and not (values.min() >= 0.0 and values.max() <= 1.0):
+    if not are_probabilities(values):
         raise ConversionError(f"{what} must hold probabilities in [0, 1], got {values.min()} to {values.max()}")
 
 
