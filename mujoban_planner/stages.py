@@ -20,7 +20,7 @@ from mujoban_core.program import read_changes
 from mujoban_core.ranges import check_counts, check_positive
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.growth import beginning
-from mujoban_planner.imitation import ImitationConfig, imitation
+from mujoban_planner.imitation import ImitationConfig, LearnerConfig, check_init_share, imitation
 from mujoban_planner.push_mpo import PushMPOConfig, push_mpo
 from mujoban_planner.push_ppo import PPO_PACE, PushPPOConfig, push_ppo
 from mujoban_planner.reinforcement import MPO_PACE, MPOConfig, reinforcement
@@ -112,7 +112,9 @@ class StagesConfig(NetworkConfig):
         super().__post_init__()
         check_counts(self, "seed", least=0)
         check_positive(self, "cpu_seconds")
-        _ = self.parsed
+        (_, first), *_ = self.parsed
+        if isinstance(first, LearnerConfig):  # the others begin with what the one before made
+            check_init_share(replace(first, init=self.init))
 
     @property
     def parsed(self) -> list[tuple[str, Any]]:

@@ -328,6 +328,15 @@ def test_a_bad_option_of_a_stage_is_named_before_anything_is_written(text: str, 
     assert not (tmp_path / "run").exists()
 
 
+def test_weights_that_there_are_none_of_have_no_share_in_the_first_stage_alone(tmp_path: Path) -> None:
+    half = "imitation=1 --init-share 0.5"
+    with pytest.raises(ValueError, match=r"^init_share is 0\.5: expected 0, or an --init whose share it is$"):
+        train.main(["stages", "--run", str(tmp_path / "run"), "--stages", half, "ppo=1"])
+    assert not (tmp_path / "run").exists()
+    assert StagesConfig(stages=(half,), init="weights.safetensors").parsed[0][1].init_share == 0.5
+    assert StagesConfig(stages=("ppo=1", half)).parsed[1][1].init_share == 0.5
+
+
 def test_all_options_of_the_whole_run_are_refused_in_a_stage_and_none_of_its_methods() -> None:
     whole = {option.name for kind in (train.Stages, StagesConfig, ActorOptions) for option in fields(kind)}
     for name in whole - {"config"}:
