@@ -44,7 +44,7 @@ class MPOTrainingConfig:
     window: int = 40
     """W, decisions of a window."""
     warm_up: int = 4
-    """b, decisions at a window's start that bring the memory up to date and teach nothing."""
+    """b, decisions of burn-in at a window's start, which bring the memory up to date and teach nothing."""
     windows: int = 10
     """M, windows of a batch."""
     replay: int = 32_000
@@ -56,7 +56,7 @@ class MPOTrainingConfig:
     exploration: Exploration = "pink"
     """Noise of the torques that are tried: white noise finds no reward here."""
     n_step: int = 5
-    """n, rewards of a return before the critic's word."""
+    """n of the n-step returns: rewards before they bootstrap from the critic."""
     samples: int = 20
     """N, actions drawn in each state for the E-step."""
     gamma: float = 0.99

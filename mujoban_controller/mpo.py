@@ -50,7 +50,7 @@ class MPOTrainingConfig:
     reuse: float = 4.0
     """Times that each step is learned from, on average."""
     n_step: int = 5
-    """n, rewards of a return before the critic's word."""
+    """n of the n-step returns: rewards before they bootstrap from the critic."""
     samples: int = 20
     """N, actions drawn in each state for the E-step; an even number."""
     gamma: float = 0.98

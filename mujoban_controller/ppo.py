@@ -38,9 +38,9 @@ class PPOTrainingConfig:
     length: int = 32
     """T, ticks that each robot plays before an update."""
     epochs: int = 4
-    """Times that an update learns from each of them."""
+    """Passes of an update over what was played."""
     minibatch: int = 1024
-    """M, samples of a step of the optimiser."""
+    """M, samples of a minibatch."""
     gamma: float = 0.98
     """Discount from one tick to the next."""
     decay: float = 0.95
@@ -57,7 +57,7 @@ class PPOTrainingConfig:
     bound_weight: float = 0.05
     """Weight of the squared distance by which means lie outside [-1.2, 1.2]."""
     mirror_weight: float = 1.0
-    """Weight of the loss by which the mirrored robot is to do the mirrored thing."""
+    """Weight of the loss of symmetry: the mirrored robot is to do the mirrored thing."""
     normalised: int = 300
     """Updates after which the normalisation of features stays as it is."""
     loss: PPOConfig = field(default_factory=PPOConfig)
