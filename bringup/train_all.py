@@ -85,8 +85,9 @@ _MINED: Final = ("--mined", "0.25", "--led", "1", "--evaluations", "3")
 """Of a planner that goes on, a quarter of the levels are such as it lost: of others it wins most, and learns nothing.
 In whatever it loses it is sought which push did it; and its own play, which has become rare to lose, gets more time."""
 _GENTLY: Final = ("--learning-rate", "4e-4", "--init-share", "0.5")
-"""And it keeps what it knows: at a rate for weights as drawn it is worse until the rate falls again, and half way
-between what it was and what it becomes lie weights that solve more than both (docs/research/planner.md)."""
+"""And it keeps what it knows: at a rate for weights as drawn it is worse until the rate falls again. What ships lies
+half way between what it was and what it becomes: it solved 811 of the 1,000 levels of medium-valid-000, both ends 800
+and 802, whose 95 % intervals overlap."""
 _LEVELS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
 _VALIDATION_PER_HOUR: Final = 6
