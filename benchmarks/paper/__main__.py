@@ -81,7 +81,7 @@ FIGURE_2 = """At every difficulty by the planner's policy alone, and as by defau
 FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
 where one begins, and the axes of rates are cut. Of the controller they are its trainings as a camera policy, as a
 student and by MPO, three times each. A sample of the planner is an evaluation of its network in the search that teaches
-it; its two trainings on a core are drawn, as the one before them, [on a GPU](../research/weights.md), left no curve.
+it; its three trainings on a core are drawn, as the one before them, [on a GPU](../research/weights.md), left no curve.
 What the termination seems to lose comes from the recordings that it was judged on, in which no late end counts, and in
 its second round from ends in an episode's first tick, for which the stack does not ask: [on recordings that can
 tell](../research/estimator.md#recordings-to-judge-by) 98.2 % of its ends are within 2 ticks. The [model
