@@ -24,6 +24,7 @@ from bringup.pipeline import Pipeline, Stage
 from bringup.training_display import run_shown
 from bringup.training_options import BAGS, PRODUCTS, WEIGHTS, Options
 from bringup.training_report import EVALUATIONS, write_report
+from bringup.training_sizes import goes_on_between
 from mujoban_core.bodies import BALL, get_body
 from mujoban_core.program import read_options, run_command
 from mujoban_sokoban.generator import FRESH_SEEDS, SENSES_SEEDS, TRAIN_SEEDS
@@ -84,10 +85,8 @@ _VIEWS: Final = ("--noise", "0.05", "--hidden", "0.1")
 _MINED: Final = ("--mined", "0.25", "--led", "1", "--evaluations", "3")
 """Of a planner that goes on, a quarter of the levels are such as it lost: of others it wins most, and learns nothing.
 In whatever it loses it is sought which push did it; and its own play, which has become rare to lose, gets more time."""
-_GENTLY: Final = ("--learning-rate", "4e-4", "--init-share", "0.5")
-"""And it keeps what it knows: at a rate for weights as drawn it is worse until the rate falls again. What ships lies
-half way between what it was and what it becomes: it solved 811 of the 1,000 levels of medium-valid-000, both ends 800
-and 802, whose 95 % intervals overlap."""
+_GENTLY: Final = ("--learning-rate", "4e-4")
+"""And it keeps what it knows: at a rate for weights as drawn it is worse until the rate falls again."""
 _LEVELS: Final = {"bags_first": 1, "bags_second": 2}
 """Each recording draws levels of its own, so many billion seeds into those for training; another `seed`, others."""
 _VALIDATION_PER_HOUR: Final = 6
@@ -208,7 +207,8 @@ def _planner(options: Options) -> list[Stage]:
     begun, last = (), ()
     if options.before is not None:
         begun = (*_from_before(options, "--init", "planner"), *_MINED)
-        last = (*options.machine.begun_with(options.before / product), *_GENTLY)
+        before = options.before / product
+        last = (*options.machine.begun_with(before), *_GENTLY, *goes_on_between(before))
     return [
         _trainer(
             options, "planner", (*command, *begun, *_VIEWS), product, sources=_sources(options, "planner"),

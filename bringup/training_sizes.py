@@ -37,6 +37,8 @@ _STREAMS_ALONE: Final = 5
 """Rows of the senses' batch on one core."""
 _STREAMS_EACH: Final = 3
 """And for each of several."""
+_LOSES_FEW: Final = 0.95
+"""Share of the held-out levels of difficulty 5 that a planner solves which hardly changes any more."""
 
 
 @dataclass(frozen=True)
@@ -110,3 +112,21 @@ class Machine:
         else:
             helpers = ("--num-actors" if stage.startswith("planner") else "--threads", str(cores))
         return (*_ON_GPU.get(stage, ()), *helpers)
+
+
+def goes_on_between(planner: Path) -> tuple[str, ...]:
+    """Return the options by which a planner that loses few levels ends between what it was and what it becomes.
+
+    The ends of all its trainings since then have equal shares: where each changes little, their mean solves more than
+    they do (docs/research/planner.md#half-way). One that still learns a lot is only held back.
+
+    Raises:
+        WeightsError: If the weights have no record.
+    """
+    from mujoban_rl.weights import read_record
+
+    record = read_record(planner)
+    if (record.get("metrics") or {}).get("success_rate/5", 0.0) < _LOSES_FEW:
+        return ()
+    share = (record.get("training") or {}).get("init_share", 0.0)
+    return ("--init-share", f"{1.0 / (2.0 - share):.3f}")

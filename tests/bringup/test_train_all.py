@@ -33,14 +33,15 @@ def commands(options: Options) -> dict[str, tuple[str, ...]]:
     return {stage.name: stage.command for stage in stages(options)}
 
 
-def finished(folder: Path, planner: NetworkConfig | None = None, **training: Any) -> Path:
+def finished(folder: Path, planner: NetworkConfig | None = None, solved: float = 0.0, **training: Any) -> Path:
     """Make what a finished run leaves; stages look at names, and at the record of the planner."""
     for product in PRODUCTS.values():
         path = folder / product
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     network = (planner or ExpertIterationConfig().network).build()
-    save_weights(folder / PRODUCTS["planner"], network, network.config, {"training": training})
+    record = {"training": training, "metrics": {"success_rate/5": solved}}
+    save_weights(folder / PRODUCTS["planner"], network, network.config, record)
     return folder
 
 
@@ -107,6 +108,19 @@ def test_a_planner_of_the_same_size_needs_no_options(tmp_path: Path) -> None:
     """So the commands of runs that were begun before stay what they were."""
     begun = commands(Options(run=tmp_path / "run", before=finished(tmp_path / "before")))
     assert not {"--architecture", "--channels", "--blocks", "--thoughts"} & {*begun["planner"]}
+
+
+@pytest.mark.parametrize(
+    ("solved", "training", "share"),
+    [(0.94, {}, 0.0), (0.95, {}, 0.5), (0.99, {"init_share": 0.5}, 0.667), (0.99, {"init_share": 0.667}, 0.75)],
+)
+def test_a_planner_that_loses_few_levels_ends_as_the_mean_of_all_its_ends(
+    tmp_path: Path, solved: float, training: dict[str, float], share: float
+) -> None:
+    begun = commands(Options(run=tmp_path / "run", before=finished(tmp_path / "before", solved=solved, **training)))
+    programs = {"expert-iteration": mujoban_planner.train.ExpertIteration}
+    options = read_options(programs, begun["planner"][2:], "planner")
+    assert options.config.init_share == pytest.approx(share, abs=1e-3)
 
 
 def test_a_planner_without_a_record_is_refused_before_anything_begins(tmp_path: Path) -> None:
