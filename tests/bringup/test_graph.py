@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image, JointState
 from std_srvs.srv import SetBool, Trigger
 
 from bringup.command import Choice, Stack
-from bringup.graph import NODES, InProcess, Processes
+from bringup.graph import NODES, GraphError, InProcess, Processes
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_core.bodies import ANT
@@ -196,6 +196,22 @@ def test_processes_that_are_killed_are_started_again(ros, oracles):
         spin_until(monitor.finished.done)
         assert processes.restarts == {"controller": 1, "simulator": 1}
         assert monitor.results[0].solved and monitor.results[0].seed == 47
+
+
+def test_a_process_that_answers_no_tick_is_given_up_after_a_few_starts(ros, oracles, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "importable"))
+    episodes = Episodes(1, 47, difficulty=2)
+    stack = Stack(oracles.choices | {"controller": Choice("controller", "misfits:FailingController")})
+    parameters = graph_parameters(stack, episodes)
+    with InProcess(parameters, ()) as graph, Processes(parameters) as processes:
+        monitor = graph.add(MonitorNode(episodes))
+        said = r"the controller node has ended 3 times without an answer to a tick, with status 1 at last: .*no legs"
+        deadline = time.monotonic() + 100
+        with pytest.raises(GraphError, match=said):
+            while time.monotonic() < deadline:
+                processes.supervise(begun=monitor.ticks > 0)
+                graph.executor.spin_once(timeout_sec=0.05)
+        assert processes.restarts == {"controller": 2}
 
 
 def test_pause_holds_the_world_and_step_advances_it_by_one_tick(play_graph):
