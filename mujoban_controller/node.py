@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from mujoban_msgs.msg import Episode
 
+from mujoban_core.answers import answer_and_memory, check_torques
 from mujoban_core.interfaces import Controller, ControllerInput, GroundTruth
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
@@ -29,7 +30,7 @@ class ControllerNode(ModuleNode[Controller]):
 
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
         """Act for one tick."""
-        torque, self.state = self.module.step(
+        said = self.module.step(
             ControllerInput(
                 np.array([inputs[topics.INSTRUCTION.name].direction], np.int64),
                 inputs[topics.CAMERA.name][None],
@@ -39,6 +40,9 @@ class ControllerNode(ModuleNode[Controller]):
             ),
             self.state,
         )
+        torque, self.state = answer_and_memory("step of the controller", said)
+        if self.driven is not None:
+            check_torques(torque, (1, self.driven.action_size))
         return self.say(episode, conversions.torque_value(torque[0]), conversions.torque_to_msg)
 
 

@@ -198,6 +198,21 @@ def test_processes_that_are_killed_are_started_again(ros, oracles):
         assert monitor.results[0].solved and monitor.results[0].seed == 47
 
 
+@pytest.mark.parametrize(
+    ("role", "misfit", "said"),
+    [
+        ("estimator", "FlatEstimator", r"the estimator gives .* of shape \(1, 3\): expected \(1, 10, 10, 4\)"),
+        ("termination", "DoubtfulTermination", r"the termination gives .* of shape \(1, 3\): expected \(1,\)"),
+        ("planner", "CarelessPlanner", "decide of the planner returns ndarray: expected two"),
+        ("controller", "ManyHandedController", r"torques of shape \(1, 5\): expected \(1, 2\)"),
+    ],
+)
+def test_a_module_that_answers_by_another_shape_ends_the_graph_and_is_named(play_graph, oracles, role, misfit, said):
+    graph = play_graph(Stack(oracles.choices | {role: Choice(role, f"misfits:{misfit}")}))
+    with pytest.raises(ValueError, match=said):
+        graph.finish()
+
+
 def test_a_process_that_answers_no_tick_is_given_up_after_a_few_starts(ros, oracles, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "importable"))
     episodes = Episodes(1, 47, difficulty=2)
