@@ -66,9 +66,9 @@ class NetworkConfig:
     features: int = FEATURES
     hidden: int = HIDDEN
     place: bool = True
-    """Whether it keeps where the robot is within its cell."""
+    """It keeps where the robot is within its cell, unless --network.no-place is given."""
     way: bool = True
-    """Whether it works out from that how far it is to where the instruction leads."""
+    """It works out from that how far it is to where the instruction leads, unless --network.no-way is given."""
 
 
 @dataclass(frozen=True)

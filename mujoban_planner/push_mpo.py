@@ -64,8 +64,8 @@ class PushMPOConfig(PushRunConfig):
     discount: float = 0.97
     """Per push."""
     time_outs_lost: bool = True
-    """Whether a level that time cuts short counts as lost, though how many moves are left is not seen; it is left out
-    otherwise."""
+    """A level that time cuts short counts as lost, though how many moves are left is not seen; it is left out with
+    --no-time-outs-lost."""
     q_weight: float = 5.0
     """Weight of the critic's loss."""
     average: float = 0.99
