@@ -71,7 +71,9 @@ class PushMPOConfig(PushRunConfig):
     average: float = 0.99
     """Share of the target network that an update leaves; it is what is shipped."""
     learning_rate: float = 1e-3
+    """Learning rate."""
     dual_learning_rate: float = 1e-2
+    """Learning rate of temperatures and multipliers."""
     warm_up: float = 0.01
     """Share of the budget in which the learning rate rises."""
     last_rate: float = 0.1
