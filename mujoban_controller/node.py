@@ -16,7 +16,7 @@ from mujoban_msgs.msg import Episode
 from mujoban_core.answers import answer_and_memory, check_torques
 from mujoban_core.interfaces import Controller, ControllerInput, GroundTruth
 from mujoban_core.signals import leave
-from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py import topics
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Output, run_node
 
@@ -43,7 +43,7 @@ class ControllerNode(ModuleNode[Controller]):
         torque, self.state = answer_and_memory("step of the controller", said)
         if self.driven is not None:
             check_torques(torque, (1, self.driven.action_size))
-        return self.say(episode, conversions.torque_value(torque[0]), conversions.torque_to_msg)
+        return self.say_torque(episode, torque[0])
 
 
 def main(args: Sequence[str] | None = None) -> int:

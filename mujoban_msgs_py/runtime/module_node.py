@@ -147,6 +147,12 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         said = Adapted(conversions.stamp_of(episode), value, partial(to_msg, episode.header))
         return [Output(self._publisher, said)]
 
+    def say_torque(self, episode: Episode, torque: NDArray[np.float32]) -> Sequence[Output]:
+        """Return a tick's torques, [U], as the answer; the joints have names where the module is of a known body."""
+        joints = () if self.driven is None else self.driven.actuated
+        to_msg = partial(conversions.torque_to_msg, joints=joints)
+        return self.say(episode, conversions.torque_value(torque), to_msg)
+
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
         """Start `self.state` at the first tick that the module sees of an episode."""
         self.state = self.initial_state(episode.episode)

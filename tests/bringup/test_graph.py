@@ -294,6 +294,14 @@ def test_a_bad_torque_is_rejected_counted_and_zero_is_held(play_graph, effort):
     assert np.abs(graph.simulator.world.velocity).max() < 0.05
 
 
+@pytest.mark.parametrize("choices", [{}, {"controller": Choice("controller")}])
+def test_torques_name_the_joints_and_the_frame_that_they_are_of(play_graph, oracles, choices):
+    graph, heard = play_graph(Stack(oracles.choices | choices)), []
+    graph.tap.create_subscription(JointState, topics.TORQUE.name, heard.append, topics.TORQUE.qos)
+    graph.spin_until(lambda: heard)
+    assert (heard[0].header.frame_id, heard[0].name) == ("base_link", ["roll", "steer"])
+
+
 def test_a_torque_of_an_unknown_episode_is_counted_and_changes_nothing(play_graph):
     graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
     publisher = graph.tap.create_publisher(JointState, topics.TORQUE.name, topics.TORQUE.qos)
