@@ -48,6 +48,9 @@ def _has_other_egl_driver() -> bool:
 
 def main() -> int:
     """Return 0, or 2 after one line on stderr."""
+    if {"-h", "--help"} & {*sys.argv[1:]}:
+        print(f"usage: {Path(sys.argv[0]).name}\n\n{__doc__}\nExit status: 0 if it lacks nothing, else 2.")
+        return 0
     if sys.version_info < (3, 11):  # noqa: UP036 - that is what is checked
         print(f"error: Python {platform.python_version()} is too old: 3.11 or newer is needed", file=sys.stderr)
         return 2

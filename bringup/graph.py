@@ -51,6 +51,8 @@ RESPAWN_PERIOD = 0.1
 """Seconds between two looks at whether the processes live."""
 RESTART_LIMIT = 20
 """Times that a node is started again before the graph is given up."""
+SILENT_LIMIT = 3
+"""Times in a row that a node may end without an answer to a tick; a further start would end as these did."""
 
 
 class GraphError(ValueError):
@@ -60,7 +62,11 @@ class GraphError(ValueError):
 def keep_memories(parameters: Parameters, folders: Mapping[str, Path]) -> None:
     """Have each node keep in its folder what it needs to go on from where it was, when it is started again."""
     for name, values in parameters.items():
-        values["resume_file"] = str(folders[name] / f"{name}.safetensors")
+        values["resume_file"] = str(_memory(folders[name], name))
+
+
+def _memory(folder: Path, name: str) -> Path:
+    return folder / f"{name}.safetensors"
 
 
 class InProcess:
@@ -167,6 +173,8 @@ class Processes:
         self._restart_limit = restart_limit
         self.restarts: Counter[str] = Counter()
         self._ends: list[tuple[float, str]] = []
+        self._silent: Counter[str] = Counter()  # ends of each node in a row without an answer before
+        self._kept: dict[str, int] = {}
         # A folder each: what the simulator is told, such as seeds, lies nowhere near a module's process.
         self._folders = {name: RunFolder() for name in parameters}
         keep_memories(parameters, {name: folder.path for name, folder in self._folders.items()})
@@ -202,9 +210,13 @@ class Processes:
                 continue
             if status == USAGE_ERROR and not begun:
                 raise GraphError(f"the {name} node could not start")
+            self._silent[name] = 0 if self._when_kept(name) != self._kept[name] else self._silent[name] + 1
+            if self._silent[name] == SILENT_LIMIT:
+                ends = f"{SILENT_LIMIT} times without an answer to a tick"
+                raise GraphError(f"the {name} node has ended {ends}, {self._last_words(name, status)}")
             if self.restarts[name] == self._restart_limit:
                 times = self._restart_limit + 1
-                raise GraphError(f"the {name} node has ended {times} times, with status {status} at last")
+                raise GraphError(f"the {name} node has ended {times} times, {self._last_words(name, status)}")
             self.restarts[name] += 1
             self._ends.append((time.monotonic(), name))
             self._children[name] = self._start(name)
@@ -226,9 +238,25 @@ class Processes:
         for folder in self._folders.values():
             folder.remove()
 
+    def _when_kept(self, name: str) -> int:
+        """Return when a node has last kept what it remembers, as it does with each answer [ns]; 0: never."""
+        file = _memory(self._folders[name].path, name)
+        return file.stat().st_mtime_ns if file.exists() else 0
+
+    def _last_words(self, name: str, status: int) -> str:
+        file = self._last_word(name)
+        said = " ".join(file.read_text().split()) if file.exists() else ""
+        return f"with status {status} at last" + (f": {said}" if said else "")
+
+    def _last_word(self, name: str) -> Path:
+        return self._folders[name].path / "last_word"
+
     def _parameter_file(self, name: str) -> Path:
         return self._folders[name].path / "parameters.yaml"
 
     def _start(self, name: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", _KINDS[name].__module__, "--ros-args"]
-        return children.start([*command, "--params-file", str(self._parameter_file(name))])
+        self._kept[name] = self._when_kept(name)
+        self._last_word(name).unlink(missing_ok=True)
+        command += ["--params-file", str(self._parameter_file(name))]
+        return children.start(command, last_word=self._last_word(name))

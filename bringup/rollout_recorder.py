@@ -126,7 +126,7 @@ class Recorder:
         row.stamp += TICK
         seen = SimulatorTick(self._label(row, tick, m), self._progress(row, tick, m), tick.observation, tick.truth, m)
         self._observed(row, seen)
-        self._put(row, _decided(row, tick, m))
+        self._put(row, _decided(row, tick, m, self._body))
         row.sequence = int(tick.decision.sequence[m])
         row.reward, row.episode_return = float(tick.reward[m]), float(tick.episode_return[m])
         if tick.solved[m] or tick.truncated[m]:
@@ -161,7 +161,7 @@ class Recorder:
         self._put(row, {topic: row.composer.compose(topic, tick) for topic in row.composer.topics})
 
 
-def _decided(row: _Row, tick: Tick, m: int) -> dict[Topic, Message]:
+def _decided(row: _Row, tick: Tick, m: int, body: Body) -> dict[Topic, Message]:
     """Return what the four modules say in a tick."""
     said = tick.decision
     beta = said.termination
@@ -174,5 +174,5 @@ def _decided(row: _Row, tick: Tick, m: int) -> dict[Topic, Message]:
         topics.ABSTRACT_STATE: conversions.abstract_state_to_msg(header, said.abstract_state[m]),
         topics.TERMINATION: conversions.termination_to_msg(header, termination),
         topics.INSTRUCTION: conversions.instruction_to_msg(header, instruction),
-        topics.TORQUE: conversions.torque_to_msg(header, said.torque[m]),
+        topics.TORQUE: conversions.torque_to_msg(header, said.torque[m], body.actuated),
     }

@@ -55,6 +55,7 @@ class CloningConfig:
     rate: float = 5e-4
     """Largest learning rate; it falls to 0 along a half cosine."""
     clip: float = 10.0
+    """Largest norm of the gradient."""
     normalised: int = 500
     """Updates after which the normalisation of proprioception stays as it is."""
 

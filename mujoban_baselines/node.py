@@ -79,7 +79,7 @@ class AgentNode(ModuleNode[Agent]):
         """Act for one tick."""
         seen = {name: inputs[_SIGHTS[name].name][None] for name in self._sees}
         torque, self.state = self.module.step(AgentInput(**seen), self.state)
-        return self.say(episode, conversions.torque_value(torque[0]), conversions.torque_to_msg)
+        return self.say_torque(episode, torque[0])
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -92,7 +92,9 @@ class TaskConfig:
     robots: int = 64
     """B, robots that each actor plays at once."""
     body: str = "ball"
+    """The robot's body, by name."""
     world: str = DEFAULT_WORLD
+    """The physical world: reference or eased."""
 
     def __post_init__(self) -> None:
         """Reject what nobody can play."""

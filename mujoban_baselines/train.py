@@ -62,6 +62,7 @@ class RunConfig:
     cpu_seconds: float = 1e9
     """CPU seconds of all its processes at which it is complete, if its steps have not come first."""
     seed: int = 0
+    """Seed of networks and of all that is drawn."""
 
     def __post_init__(self) -> None:
         """Reject a budget of nothing and what is no seed."""
@@ -138,6 +139,7 @@ class CloneRunConfig(RunConfig):
     """A run of behaviour cloning."""
 
     body: str = "ball"
+    """Body of the robot in the bags, by name."""
     size: Size = "S"
     """Variant of the network."""
     world: str = DEFAULT_WORLD

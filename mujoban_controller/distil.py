@@ -67,6 +67,7 @@ class DistilConfig:
     noise: float = 0.1
     """Deviation of the noise on the torques of a third of the other rows, which shows the student more states."""
     learning_rate: float = 1e-3
+    """Largest learning rate."""
     warm_up_share: float = 0.01
     """Share of the budget over which the learning rate rises; it falls by a cosine after that."""
     clip: float = 5.0

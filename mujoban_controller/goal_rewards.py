@@ -35,8 +35,11 @@ class RewardConfig:
     """Weights of the goal task's reward; lengths in cells."""
 
     completed: float = 2.0
+    """Reward once for an instruction that is completed."""
     failed: float = -2.0
+    """Reward once for one that failed."""
     fallen: float = -4.0
+    """Reward of a tick in the place of all terms, where the robot has fallen."""
     progress: float = 5.0
     """Of the potential's change."""
     lane: float = 0.3

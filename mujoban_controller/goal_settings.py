@@ -20,9 +20,11 @@ class GoalTaskConfig:
     batch: int = 128
     """B, robots."""
     body: str = "ball"
+    """The robot's body, by name."""
     world: str = DEFAULT_WORLD
     """The physical world: reference or eased."""
     difficulty: int = 5
+    """Difficulty of the generated levels, 1 to 5."""
     tolerance: float = 0.08
     """Completion tolerance in cells; tighter than the paper's 0.1, so that evaluation leaves a margin."""
     planned: float = 0.7

@@ -58,7 +58,9 @@ class MPOTrainingConfig:
     target_period: int = 100
     """Updates between copies to the target networks, of each its own."""
     policy_rate: float = 3e-4
+    """Learning rate of the policy."""
     critic_rate: float = 3e-4
+    """Learning rate of the critic."""
     clip: float = 40.0
     """Largest norm of the gradient."""
     critic_first: int = 0

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from mujoban_msgs.msg import Episode
 
+from mujoban_core.answers import answer_and_memory, check_torques
 from mujoban_core.interfaces import Controller, ControllerInput, GroundTruth
 from mujoban_core.signals import leave
-from mujoban_msgs_py import conversions, topics
+from mujoban_msgs_py import topics
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_msgs_py.runtime.tick_node import Output, run_node
 
@@ -29,7 +30,7 @@ class ControllerNode(ModuleNode[Controller]):
 
     def step(self, episode: Episode, inputs: dict[str, Any], truth: GroundTruth | None) -> Sequence[Output]:
         """Act for one tick."""
-        torque, self.state = self.module.step(
+        said = self.module.step(
             ControllerInput(
                 np.array([inputs[topics.INSTRUCTION.name].direction], np.int64),
                 inputs[topics.CAMERA.name][None],
@@ -39,7 +40,10 @@ class ControllerNode(ModuleNode[Controller]):
             ),
             self.state,
         )
-        return self.say(episode, conversions.torque_value(torque[0]), conversions.torque_to_msg)
+        torque, self.state = answer_and_memory("step of the controller", said)
+        if self.driven is not None:
+            check_torques(torque, (1, self.driven.action_size))
+        return self.say_torque(episode, torque[0])
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -48,7 +48,9 @@ class PPOTrainingConfig:
     rate: float = 5e-4
     """Learning rate at the start."""
     least_rate: float = 3e-5
+    """Lowest learning rate."""
     largest_rate: float = 2e-3
+    """Highest learning rate."""
     target_kl: float = 0.02
     """The learning rate is adapted so that an update changes the policy by about this much; what it may reach at most
     falls to `least_rate` over the budget."""

@@ -63,12 +63,15 @@ class NetworkConfig:
     """What the camera policy is made of."""
 
     channels: tuple[int, ...] = WIDTHS
+    """Channels of the convolutions, one by one."""
     features: int = FEATURES
+    """Features that are read from a frame."""
     hidden: int = HIDDEN
+    """Width of the memory."""
     place: bool = True
-    """Whether it keeps where the robot is within its cell."""
+    """It keeps where the robot is within its cell, unless --network.no-place is given."""
     way: bool = True
-    """Whether it works out from that how far it is to where the instruction leads."""
+    """It works out from that how far it is to where the instruction leads, unless --network.no-way is given."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,7 @@ class TrainConfig:
     """What must not change between the bits of a run."""
 
     stage: Literal["teacher", "distil", "mpo"] = "teacher"
+    """What is trained: a privileged teacher, its student that sees, or a student that goes on by reward."""
     algorithm: Literal["mpo", "ppo"] = "ppo"
     """What teaches the teacher."""
     steps: int = 1_500_000
@@ -85,6 +89,7 @@ class TrainConfig:
     horizon_seconds: float = 1e9
     """Wall-clock seconds of training likewise: the measure where a GPU computes."""
     seed: int = 0
+    """Seed of networks, levels and noise."""
     initial: Path | None = None
     """Weights to start from."""
     teacher: Path | None = None
@@ -134,6 +139,7 @@ class Options:
     evaluate_every: int = 300_000
     """Environment steps between evaluations on validation levels."""
     evaluation_episodes: int = 64
+    """Validation levels of an evaluation; 0: none is made."""
     save_every: float = 300.0
     """Seconds between checkpoints."""
     threads: int = 1

@@ -9,12 +9,15 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import IO, Final
 
 _PARENT: Final = "MUJOBAN_PARENT"
 """Environment variable that names the process which started this one."""
+_LAST_WORD: Final = "MUJOBAN_LAST_WORD"
+"""Environment variable that names the file which takes what error has ended the process."""
 _C_LIBRARY: Final = "GLIBC_TUNABLES"
 """Environment variable with settings of glibc, which it reads when a program starts."""
 _PR_SET_PDEATHSIG: Final = 1
@@ -23,7 +26,10 @@ GRACE: Final = 0.5
 
 
 def start(
-    command: Sequence[str], environment: Mapping[str, str] | None = None, log: IO[bytes] | None = None
+    command: Sequence[str],
+    environment: Mapping[str, str] | None = None,
+    log: IO[bytes] | None = None,
+    last_word: Path | None = None,
 ) -> subprocess.Popen[bytes]:
     """Start a program that calls `end_with_parent`.
 
@@ -33,8 +39,11 @@ def start(
         command: The program and its arguments.
         environment: Variables on top of this process's environment.
         log: File that takes what the program prints; None means where this process prints.
+        last_word: File that takes the error by which the program ends, if it uses `telling`.
     """
     variables = {**os.environ, **(environment or {}), _PARENT: str(os.getpid())}
+    if last_word is not None:
+        variables[_LAST_WORD] = str(last_word)
     return subprocess.Popen(command, env=variables, process_group=0, stdout=log, stderr=log)
 
 
@@ -83,6 +92,19 @@ def end_with_parent() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != int(pid):
         raise SystemExit(128 + signal.SIGTERM)
+
+
+@contextmanager
+def telling() -> Iterator[None]:
+    """Note an error that comes out of this context for the process that has started this one, if it wants to know."""
+    file = os.environ.pop(_LAST_WORD, None)
+    try:
+        yield
+    except Exception as error:
+        if file is not None:
+            with suppress(OSError):
+                Path(file).write_text(f"{type(error).__name__}: {error}")
+        raise
 
 
 def outlast(seconds: int) -> None:

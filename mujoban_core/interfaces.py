@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_core.answers import checked_instructions
+from mujoban_core.answers import answer_and_memory, check_probabilities, checked_instructions
 from mujoban_core.grid import INSTRUCTION_LIMIT, Instruction
 from mujoban_core.trees import map_leaves
 
@@ -232,8 +232,14 @@ class Termination(Module):
         return TerminationState(self.initial_memory(len(seeds)), zeros, zeros.copy(), np.asarray(seeds, np.int64))
 
     def step(self, inputs: TerminationInput, state: TerminationState) -> tuple[TerminationOutput, TerminationState]:
-        """Return beta_t and the next state. On an episode's first tick nothing is in force and beta is false."""
-        probability, memory = self.probability(inputs, state.memory)
+        """Return beta_t and the next state. On an episode's first tick nothing is in force and beta is false.
+
+        Raises:
+            ValueError: If what `probability` gives is not one for each robot.
+        """
+        said = self.probability(inputs, state.memory)
+        probability, memory = answer_and_memory("probability of the termination", said)
+        check_probabilities("termination", probability, state.tick.shape)
         first = state.tick == 0
         probability = np.where(first, np.float32(0.0), probability)
         bar = counter_uniform(state.seed, state.tick) if self.sample else self.threshold
@@ -293,7 +299,8 @@ class Planner(Module):
             state = state._replace(memory=put_rows(state.memory, others, memory))
         if rows.size == 0:
             return state.instruction, state
-        decided, memory = self.decide(abstract_state[rows], take_rows(state.memory, rows))
+        said = self.decide(abstract_state[rows], take_rows(state.memory, rows))
+        decided, memory = answer_and_memory("decide of the planner", said)
         instruction, sequence = state.instruction.copy(), state.sequence.copy()
         instruction[rows] = checked_instructions(decided, rows.size)
         sequence[rows] += 1

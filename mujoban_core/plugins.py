@@ -63,12 +63,12 @@ def load_module(role: str, source: str = LEARNED, weights: Path | None = None, d
         role: One of `ROLES`, or `AGENT`.
         source: Name of an entry point of the role ("learned", "oracle"), or `package.module:Class`, whose instances
             are made without arguments.
-        weights: Weights of the learned module instead of those that ship.
+        weights: Weights of the learned module instead of those that ship; None for one that takes none.
         device: Device of the learned module.
 
     Raises:
-        PluginError: If the role or the class is unknown, cannot be made without arguments, or an instance is not of the
-            role's interface.
+        PluginError: If the role or the class is unknown, cannot be made without arguments, or takes no weights and is
+            given some, or an instance is not of the role's interface.
         ValueError: If weights are missing or damaged.
     """
     return _make(role, _interface(role), source, weights, device)
@@ -114,6 +114,8 @@ def _make(role: str, interface: type[Made], source: str, weights: Path | None, d
     if not callable(make):
         raise PluginError(f"{source} is a {type(make).__name__}: expected a class or a function that makes a {role}")
     plain = ":" in source or isinstance(make, type)
+    if plain and weights is not None:
+        raise PluginError(f"the {role} {source} takes no weights, expected none; got {weights}")
     module = _without_arguments(role, source, make) if plain else make(weights, device)
     if not isinstance(module, interface):
         expected = f"{interface.__module__}.{interface.__name__}"

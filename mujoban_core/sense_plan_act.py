@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_core.answers import check_probabilities
+from mujoban_core.answers import answer_and_memory, answering, check_probabilities
 from mujoban_core.bodies import FIRST_PERSON_CAMERA
 from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.interfaces import (
@@ -99,28 +99,30 @@ class SensePlanAct:
         What is seen or estimated each module gets as arrays of its own, which it may write into.
 
         Raises:
-            ValueError: If a module answers by numbers that its role does not have.
+            ValueError: If a module answers by what its role does not have.
+            ModuleError: If one has failed.
         """
         robots = len(obs.pose)
-        estimate, estimator_state = self.estimator.step(
-            EstimatorInput(obs.frame.copy(), obs.pose.copy(), self._truth_for("estimator", truth)), state.estimator
-        )
-        check_probabilities("estimator", estimate, (robots, GRID_SIZE, GRID_SIZE, len(CHANNELS)))
+        with answering("estimator"):
+            said = self.estimator.step(
+                EstimatorInput(obs.frame.copy(), obs.pose.copy(), self._truth_for("estimator", truth)), state.estimator
+            )
+            estimate, estimator_state = answer_and_memory("step of the estimator", said)
+            check_probabilities("estimator", estimate, (robots, GRID_SIZE, GRID_SIZE, len(CHANNELS)))
         previous = np.where(state.planner.instruction < 0, NO_INSTRUCTION, state.planner.instruction)
-        beta, termination_state = self.termination.step(
-            TerminationInput(
-                obs.frame.copy(), obs.proprio.copy(), previous, state.terminated, self._truth_for("termination", truth)
-            ),
-            state.termination,
+        seen = TerminationInput(
+            obs.frame.copy(), obs.proprio.copy(), previous, state.terminated, self._truth_for("termination", truth)
         )
-        check_probabilities("termination", beta.probability, (robots,))
-        instruction, planner_state = self.planner.step(estimate.copy(), beta.terminated, state.planner)
-        torque, controller_state = self.controller.step(
-            ControllerInput(
-                instruction, obs.frame.copy(), obs.proprio.copy(), beta.terminated, self._truth_for("controller", truth)
-            ),
-            state.controller,
+        with answering("termination"):
+            beta, termination_state = self.termination.step(seen, state.termination)
+        with answering("planner"):
+            instruction, planner_state = self.planner.step(estimate.copy(), beta.terminated, state.planner)
+        told = ControllerInput(
+            instruction, obs.frame.copy(), obs.proprio.copy(), beta.terminated, self._truth_for("controller", truth)
         )
+        with answering("controller"):
+            said = self.controller.step(told, state.controller)
+            torque, controller_state = answer_and_memory("step of the controller", said)
         issued = planner_state.sequence != state.planner.sequence
         decision = Decision(estimate, beta, instruction, planner_state.sequence, issued, torque)
         return decision, PolicyState(

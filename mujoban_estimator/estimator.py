@@ -35,11 +35,16 @@ class EstimatorConfig:
     """Size of the network, body that carries the camera, and how often the belief is updated."""
 
     body: str = "ball"
+    """Name of the body."""
     stem: int = 16
+    """Channels of the first convolution."""
     channels: int = 32
+    """Channels of those after it."""
     blocks: int = 2
+    """Residual blocks after them."""
     embedding: int = 64
     belief: int = 32
+    """Channels of the belief in each cell."""
     update_every: int = 4
     """Ticks from one update of the belief to the next; in between the estimate is held."""
 

@@ -97,6 +97,7 @@ class TrainConfig:
     horizon_seconds: float = 1e9
     """Likewise of wall-clock seconds, for a GPU; evaluations are left out."""
     learning_rate: float = 1.5e-3
+    """Largest learning rate."""
     warm_up: float = 0.0025
     """Share of the budget, of steps or seconds, within which the learning rate rises from 0."""
     final_rate: float = 0.03
@@ -104,6 +105,7 @@ class TrainConfig:
     clip: float = 1.0
     """Largest norm of the gradient."""
     seed: int = 0
+    """Seed of networks and of all that is drawn."""
 
     def __post_init__(self) -> None:
         """Reject what contradicts itself."""

@@ -34,15 +34,23 @@ class TerminationConfig:
     """Size of the network, and how beta follows from its probability."""
 
     body: str = "ball"
+    """Name of the body."""
     stem: int = 16
+    """Channels of the first convolution."""
     channels: int = 32
+    """Channels of those after it."""
     blocks: int = 2
+    """Residual blocks after them."""
     camera: int = 64
+    """Features that are read from a frame."""
     hidden: int = 96
+    """Width of the memory."""
     limit: int = INSTRUCTION_LIMIT
+    """Ticks after which beta is forced."""
     sample: bool = False
     """Sample beta as in the paper, instead of comparing its probability with `threshold`."""
     threshold: float = 0.5
+    """Probability above which beta is true where it is not sampled."""
 
     def __post_init__(self) -> None:
         """Reject what is out of range."""

@@ -59,6 +59,7 @@ class Options:
     seconds: float | None = None
     """Stop, with a checkpoint, after this time."""
     threads: int = 1
+    """Threads of the networks."""
     workers: int = 1
     """Processes that read bags: 1 beside the steps, 0 to read between them, several to read all bags before them."""
     evaluate_every: int = 1000
@@ -66,6 +67,7 @@ class Options:
     save_every: float = 120.0
     """Seconds between checkpoints."""
     device: str = "cpu"
+    """Device that computes: cpu or cuda."""
     skip_damaged: bool = False
     """Leave damaged parts of bags out instead of refusing them."""
     allow_test_seeds: bool = False

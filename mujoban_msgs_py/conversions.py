@@ -29,7 +29,7 @@ from mujoban_core.bodies import BODIES, ProprioSlices
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.grid import CHANNELS, DIFFICULTIES, GRID_SIZE
 from mujoban_msgs_py.checks import ConversionError, check_probabilities, checked_direction, checked_probability, finite
-from mujoban_msgs_py.topics import Message
+from mujoban_msgs_py.topics import BODY_FRAME, Message
 
 ENCODING: Final = "rgb8"
 _SECOND: Final = 1_000_000_000
@@ -266,8 +266,9 @@ def termination_from_msg(message: Termination) -> TerminationReading:
 
 
 def torque_to_msg(header: Header, torque: ArrayLike, joints: Sequence[str] = ()) -> JointState:
-    """Return torques normalised to [-1, 1], [U]."""
+    """Return torques normalised to [-1, 1], [U], of the joints that actuators move; they are in the robot's frame."""
     values = torque_value(torque).astype(np.float64)
+    header = Header(stamp=header.stamp, frame_id=BODY_FRAME)
     return JointState(header=header, name=list(joints), effort=array("d", values.tobytes()))
 
 

@@ -52,13 +52,17 @@ class MPOSettings:
     """Instructions in each of `environments` levels before the first update."""
     batch_size: int = 256
     discount: float = DISCOUNT
+    """Discount from one move to the next."""
     learning_rate: float = 1e-4
+    """Learning rate."""
     dual_learning_rate: float = 1e-2
+    """Learning rate of temperatures and multipliers."""
     target_period: int = 100
     """Updates between copies to the target network."""
     q_weight: float = 0.5
     """Weight of the critic's loss."""
     seed: int = 0
+    """Seed of networks and of all that is drawn."""
 
     def __post_init__(self) -> None:
         """Reject numbers with which nothing is played or learned, and what is no share."""

@@ -62,7 +62,7 @@ class Options:
     weights: Path = SHIPPED
     """Weights with their record."""
     optimal: bool = True
-    """Compare moves with optimal solutions."""
+    """Moves are compared with optimal solutions, unless --no-optimal is given."""
     device: str = "cpu"
     """Device of the network."""
     threads: int = 1

@@ -37,6 +37,7 @@ class ExpertIterationConfig(LearnerConfig):
     first_evaluations: int = 8192
     """Those before the first update."""
     learning_rate: float = 1.5e-3
+    """Learning rate."""
     warm_up: float = 0.01
     """Share of the budget in which the learning rate rises."""
     plan_weight: float = 1.0

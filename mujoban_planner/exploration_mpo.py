@@ -64,6 +64,7 @@ class ExplorerConfig(PlayConfig):
     replay_steps: int = 300
     discount: float = 0.97
     learning_rate: float = 1e-3
+    """Learning rate."""
     warm_up: float = 0.01
     """Share of the budget over which the learning rate rises; then it falls to 0."""
     q_weight: float = 5.0

@@ -47,7 +47,9 @@ class LearnerConfig(NetworkConfig):
     """What defines a network and how it learns from labelled states."""
 
     learning_rate: float = 1e-3
+    """Learning rate."""
     weight_decay: float = 1e-3
+    """Decay of the weights, of AdamW."""
     warm_up: float = 0.02
     """Share of the schedule in which the learning rate rises."""
     plan_weight: float = 3.0
@@ -68,6 +70,7 @@ class LearnerConfig(NetworkConfig):
     """Their share in what is played and shipped, the rest being the average's: what lies between a network and what a
     further training makes of it often solves more than both (Wortsman et al. 2022, WiSE-FT)."""
     seed: int = 0
+    """Seed of networks and of all that is drawn."""
 
     def __post_init__(self) -> None:
         """Reject networks of nothing, and what is no rate, no share and no thinking time."""

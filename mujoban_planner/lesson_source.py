@@ -33,6 +33,7 @@ class LessonConfig(UncertaintyConfig):
     """What defines the lessons of a run."""
 
     batch_size: int = 128
+    """States of an update."""
     corrections: float = 0.5
     """Share of a batch that corrects the planner's own play (DAgger), once there is some."""
     judged: float = 1.0
@@ -56,6 +57,7 @@ class LessonConfig(UncertaintyConfig):
     buffer: int = 2_000_000
     """Samples kept of demonstrations, and as many of corrections."""
     seed: int = 0
+    """Seed of networks and of all that is drawn."""
 
     def __post_init__(self) -> None:
         """Reject lessons of nothing, and what is no share."""

@@ -64,14 +64,16 @@ class PushMPOConfig(PushRunConfig):
     discount: float = 0.97
     """Per push."""
     time_outs_lost: bool = True
-    """Whether a level that time cuts short counts as lost, though how many moves are left is not seen; it is left out
-    otherwise."""
+    """A level that time cuts short counts as lost, though how many moves are left is not seen; it is left out with
+    --no-time-outs-lost."""
     q_weight: float = 5.0
     """Weight of the critic's loss."""
     average: float = 0.99
     """Share of the target network that an update leaves; it is what is shipped."""
     learning_rate: float = 1e-3
+    """Learning rate."""
     dual_learning_rate: float = 1e-2
+    """Learning rate of temperatures and multipliers."""
     warm_up: float = 0.01
     """Share of the budget in which the learning rate rises."""
     last_rate: float = 0.1

@@ -43,6 +43,7 @@ class PushPPOConfig(PushRunConfig):
     epochs: int = 3
     """Times that each rollout is learned from."""
     minibatch: int = 512
+    """States of a step of the optimiser."""
     discount: float = 0.97
     """Per push."""
     decay: float = 0.95
@@ -50,6 +51,7 @@ class PushPPOConfig(PushRunConfig):
     entropy: float = 0.01
     """Weight of the policy's entropy."""
     learning_rate: float = 1e-3
+    """Learning rate."""
     warm_up: float = 0.01
     """Share of the budget in which the learning rate rises."""
 

@@ -31,6 +31,7 @@ class PushRunConfig(NetworkConfig):
     updates: float = 1e9
     """Updates after which it is complete."""
     seed: int = 0
+    """Seed of networks and of all that is drawn."""
     anchor: float = 1.0
     """Of a run that starts from weights: how much it counts that heads which it does not teach go on saying what they
     said; 0 lets them drift."""

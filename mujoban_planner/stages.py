@@ -106,6 +106,7 @@ class StagesConfig(NetworkConfig):
     cpu_seconds: float = 10_800.0
     """CPU seconds of all together."""
     seed: int = 0
+    """Seed of networks and of all that is drawn."""
 
     def __post_init__(self) -> None:
         """Reject networks of nothing, budgets of nothing, and what is no method, no share or no option of a stage."""

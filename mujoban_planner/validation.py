@@ -53,11 +53,11 @@ class NetworkConfig:
     repeats: int = 3
     """Repeats of the ConvLSTM layers (recurrent)."""
     propagation: bool = True
-    """Whether it spreads over the board by the rules where the robot can walk and boxes be pushed, which the paper's
-    network does not."""
+    """It spreads over the board by the rules where the robot can walk and boxes be pushed; the paper's network does
+    not, nor does it with --no-propagation."""
 
     judge: bool = True
-    """Whether it judges each push where the box is (with propagation)."""
+    """It judges each push where the box is (with propagation), unless --no-judge is given."""
 
     def __post_init__(self) -> None:
         """Reject networks of nothing."""

@@ -118,8 +118,8 @@ class World(Portable):
         self.batch = batch
         self.max_boxes = max_boxes
         self.time_limit = self.body.time_limit if time_limit is None else time_limit
-        if not self.time_limit >= 1:
-            raise ValueError(f"time_limit is {time_limit}: expected at least 1 step")
+        if not isinstance(self.time_limit, int | np.integer) or self.time_limit < 1:
+            raise ValueError(f"time_limit is {time_limit}: expected a whole number of steps, at least 1")
         self.goals = GoalTracker(batch, cell_size=self.body.cell_size, tolerance=tolerance, max_box_speed=max_box_speed)
         self._threads = threads
         self._all_rows = self._live = np.arange(batch)

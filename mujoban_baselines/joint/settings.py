@@ -21,7 +21,9 @@ class StartingWeights:
     """Where the modules come from; by default what ships for the body."""
 
     controller: Path | None = None
+    """Learns on."""
     planner: Path | None = None
+    """Its head learns on."""
     estimator: Path | None = None
     """Stays as it is."""
     termination: Path | None = None
@@ -49,6 +51,7 @@ class PlannerSettings:
     discount: float = DISCOUNT
     """Of an instruction; by default that of the planner whose head goes on learning."""
     rate: float = 3e-5
+    """Learning rate."""
     critic_first: int = 400
     """Updates in which its critic learns alone."""
     anchor: float = 1.0

@@ -205,6 +205,11 @@ class Body:
         """U, the number of actuators."""
         return len(self.actuators)
 
+    @cached_property
+    def actuated(self) -> tuple[str, ...]:
+        """Names of the joints that actuators move, one for each of these."""
+        return tuple(actuator.joint for actuator in self.actuators)
+
     @property
     def proprio_size(self) -> int:
         """P, the number of proprioceptive values."""

@@ -16,7 +16,8 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
-from mujoban_core.bodies import BALL, BODIES, get_body
+from mujoban_core.answers import answering
+from mujoban_core.bodies import BALL, BODIES, Body, get_body
 from mujoban_core.interfaces import GroundTruth, Module, module_seeds
 from mujoban_core.look_around import LOOKING_ROLES, Scout, look_around
 from mujoban_core.plugins import (
@@ -136,7 +137,7 @@ class ModuleNode(TickNode, Generic[ModuleT]):
 
     def check(self, topic: Topic, item: Any) -> None:
         """Refuse the proprioception of another body, such as that of a simulator which was started with one."""
-        body = None if topic is not topics.PROPRIO or self._driven is None else BODIES.get(self._driven)
+        body = self.driven if topic is topics.PROPRIO else None
         if body is not None and item.shape != (body.proprio_size,):
             said = f"o_pr of the body {body.name} must have shape [{body.proprio_size}], got {[*item.shape]}"
             raise conversions.ConversionError(said)
@@ -145,6 +146,12 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         """Return a tick's answer: a value as the topic's reader has it, and what makes its message of a header."""
         said = Adapted(conversions.stamp_of(episode), value, partial(to_msg, episode.header))
         return [Output(self._publisher, said)]
+
+    def say_torque(self, episode: Episode, torque: NDArray[np.float32]) -> Sequence[Output]:
+        """Return a tick's torques, [U], as the answer; the joints have names where the module is of a known body."""
+        joints = () if self.driven is None else self.driven.actuated
+        to_msg = partial(conversions.torque_to_msg, joints=joints)
+        return self.say(episode, conversions.torque_value(torque), to_msg)
 
     def begin(self, episode: Episode, inputs: dict[str, Any]) -> None:
         """Start `self.state` at the first tick that the module sees of an episode."""
@@ -162,7 +169,8 @@ class ModuleNode(TickNode, Generic[ModuleT]):
             self._episode = episode.episode
             self.begin(episode, inputs)
         inputs = _own(inputs)
-        return self.step(episode, inputs, _ground_truth(inputs) if self._truth else None)
+        with answering(self.role):
+            return self.step(episode, inputs, _ground_truth(inputs) if self._truth else None)
 
     def start_anew(self) -> None:
         """Forget the state as well, which is of another world."""
@@ -200,6 +208,11 @@ class ModuleNode(TickNode, Generic[ModuleT]):
         ticks = body.look_ticks if self._look_around == OWN_LOOK else self._look_around
         driven = trained_body(module) or self._body or None
         return cast(ModuleT, look_around(self.prepare(module), ticks, self.scout, body)), driven
+
+    @property
+    def driven(self) -> Body | None:
+        """The body that the module is of, where it is of one that is known."""
+        return None if self._driven is None else BODIES.get(self._driven)
 
     @property
     def scout(self) -> Scout | None:

@@ -30,7 +30,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
-from mujoban_core.children import end_with_parent
+from mujoban_core.children import end_with_parent, telling
 from mujoban_core.signals import StopSignal, interruptible
 from mujoban_msgs_py.adapted import Adapted
 from mujoban_msgs_py.arrivals import Arrival
@@ -311,7 +311,7 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> int
             return 0
         if given:
             raise ValueError(f"{given[0]} is no option of a node, expected {_USAGE}")
-        with interruptible(), StopSignal(deferred=False) as stop, ros_context(args):
+        with telling(), interruptible(), StopSignal(deferred=False) as stop, ros_context(args):
             _run(make, stop)
     except KeyboardInterrupt:
         pass

@@ -23,6 +23,7 @@ class ActorOptions:
     actors: Literal["local", "threads", "processes", "ray"] = "local"
     """In the learner's process by turns, in threads, in processes, or on Ray."""
     num_actors: int = 1
+    """Processes that play."""
     schedule: Schedule | None = None
     """`turns`: actors and learner by turns; `ordered`: both at once, in an order that makes runs repeatable; `first`:
     both at once, whoever is ready first, so that no run is like another. By default `turns` for local, `first` for

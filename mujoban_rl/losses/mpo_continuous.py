@@ -34,9 +34,13 @@ class MPOConfig:
     epsilon_penalty: float = 0.001
     """Constraint of the E-step which keeps actions in [-1, 1]; 0 leaves it out."""
     initial_temperature: float = 10.0
+    """Temperature of the E-step at the start."""
     initial_alpha_mean: float = 10.0
+    """Multiplier of the constraint on the mean at the start."""
     initial_alpha_scale: float = 1000.0
+    """Multiplier of the constraint on the scale at the start."""
     dual_learning_rate: float = 1e-2
+    """Learning rate of temperatures and multipliers."""
 
     def __post_init__(self) -> None:
         """Reject constraints that cannot hold."""

@@ -20,6 +20,7 @@ class PPOConfig:
     clip: float = 0.2
     """Largest relative change of an action's probability that is still rewarded."""
     value_weight: float = 0.5
+    """Weight of the squared errors of values."""
 
     def __post_init__(self) -> None:
         """Reject bounds that bound nothing."""

@@ -24,7 +24,9 @@ class VTraceConfig:
     clip_c: float = 1.0
     """Bound of the weights that carry differences back in time: how fast they arrive."""
     value_weight: float = 0.5
+    """Weight of the squared errors of values."""
     entropy_weight: float = 1e-3
+    """Weight of the bonus for entropy."""
 
     def __post_init__(self) -> None:
         """Reject bounds with which nothing is learned."""

@@ -89,12 +89,19 @@ def test_one_command_trains_each_module_and_names_what_it_does_not_know(capfd, m
 
 @pytest.mark.parametrize(
     "trained",
-    [["controller"], ["estimator"], *(["baselines", m] for m in ("monolithic-mpo", "structured-vtrace", "clone"))],
+    [
+        ["controller"],
+        ["estimator"],
+        *(["planner", m] for m in ("imitation", "mpo")),
+        *(["baselines", m] for m in ("monolithic-mpo", "structured-vtrace", "clone")),
+    ],
     ids=" ".join,
 )
 def test_help_explains_by_more_than_a_letter_of_the_code(capfd, trained):
     assert run(train, *trained, "--help") == 0
-    assert not re.findall(r"(--\S+) +\S+\s+[│ ]*[A-Za-z]\. ", capfd.readouterr().out)
+    assert not re.findall(r"(--\S+) +\S+\s+[│ ]*[A-Za-z]\. ", out := capfd.readouterr().out)
+    told = r"(?:rate|seed|body|world|num-actors|discount|threads|device|reward\.\S+)"
+    assert not re.findall(rf"(--(?:\S+[.-])?{told}) +\S+\s+[│ ]*\(default", out)
 
 
 def test_what_cannot_be_trained_is_one_line(capfd):

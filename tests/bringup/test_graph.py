@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image, JointState
 from std_srvs.srv import SetBool, Trigger
 
 from bringup.command import Choice, Stack
-from bringup.graph import NODES, InProcess, Processes
+from bringup.graph import NODES, GraphError, InProcess, Processes
 from bringup.monitor import MonitorNode
 from bringup.parameters import graph_parameters
 from mujoban_core.bodies import ANT
@@ -198,6 +198,37 @@ def test_processes_that_are_killed_are_started_again(ros, oracles):
         assert monitor.results[0].solved and monitor.results[0].seed == 47
 
 
+@pytest.mark.parametrize(
+    ("role", "misfit", "said"),
+    [
+        ("estimator", "FlatEstimator", r"the estimator gives .* of shape \(1, 3\): expected \(1, 10, 10, 4\)"),
+        ("termination", "DoubtfulTermination", r"the termination gives .* of shape \(1, 3\): expected \(1,\)"),
+        ("planner", "CarelessPlanner", "decide of the planner returns ndarray: expected two"),
+        ("controller", "ManyHandedController", r"torques of shape \(1, 5\): expected \(1, 2\)"),
+    ],
+)
+def test_a_module_that_answers_by_another_shape_ends_the_graph_and_is_named(play_graph, oracles, role, misfit, said):
+    graph = play_graph(Stack(oracles.choices | {role: Choice(role, f"misfits:{misfit}")}))
+    with pytest.raises(ValueError, match=said):
+        graph.finish()
+
+
+def test_a_process_that_answers_no_tick_is_given_up_after_a_few_starts(ros, oracles, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "importable"))
+    episodes = Episodes(1, 47, difficulty=2)
+    stack = Stack(oracles.choices | {"controller": Choice("controller", "misfits:FailingController")})
+    parameters = graph_parameters(stack, episodes)
+    with InProcess(parameters, ()) as graph, Processes(parameters) as processes:
+        monitor = graph.add(MonitorNode(episodes))
+        said = r"the controller node has ended 3 times without an answer to a tick, with status 1 at last: .*no legs"
+        deadline = time.monotonic() + 100
+        with pytest.raises(GraphError, match=said):
+            while time.monotonic() < deadline:
+                processes.supervise(begun=monitor.ticks > 0)
+                graph.executor.spin_once(timeout_sec=0.05)
+        assert processes.restarts == {"controller": 2}
+
+
 def test_pause_holds_the_world_and_step_advances_it_by_one_tick(play_graph):
     graph = play_graph()
     graph.spin_until(lambda: graph.simulator.ticks >= 5)
@@ -261,6 +292,14 @@ def test_a_bad_torque_is_rejected_counted_and_zero_is_held(play_graph, effort):
     graph.spin_until(lambda: graph.simulator.ticks == 1)
     assert graph.simulator.counts["rejected torques"] == 1
     assert np.abs(graph.simulator.world.velocity).max() < 0.05
+
+
+@pytest.mark.parametrize("choices", [{}, {"controller": Choice("controller")}])
+def test_torques_name_the_joints_and_the_frame_that_they_are_of(play_graph, oracles, choices):
+    graph, heard = play_graph(Stack(oracles.choices | choices)), []
+    graph.tap.create_subscription(JointState, topics.TORQUE.name, heard.append, topics.TORQUE.qos)
+    graph.spin_until(lambda: heard)
+    assert (heard[0].header.frame_id, heard[0].name) == ("base_link", ["roll", "steer"])
 
 
 def test_a_torque_of_an_unknown_episode_is_counted_and_changes_nothing(play_graph):

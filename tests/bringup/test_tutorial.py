@@ -1,11 +1,13 @@
-"""The tutorial's planner works as printed."""
+"""The planners of the tutorial and the README work as printed."""
 
 import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from benchmarks.readme import Source, read_page
 from bringup.rollout import rollout
 from mujoban_core.plugins import load_module
 from mujoban_core.sense_plan_act import SensePlanAct
@@ -30,3 +32,21 @@ def test_the_planner_of_the_tutorial_solves_levels_with_one_box(planner):
     world = World(6, max_boxes=episodes.max_boxes)
     policy = SensePlanAct(OracleEstimator(), OracleTermination(), planner, OracleController())
     assert all(result.solved for result in rollout(policy, world, episodes))
+
+
+def test_the_planner_of_the_readme_plays_the_same_again(tmp_path, monkeypatch):
+    parts = read_page((TUTORIAL.parents[1] / "README.md").read_text())
+    (source,) = (part for part in parts if isinstance(part, Source))
+    (tmp_path / "readme_planner.py").write_text(source.text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    first, again = (decisions(load_module("planner", "readme_planner:RandomPlanner")) for _ in range(2))
+    assert first == again and {move for moves in first for move in moves} == {1, 2, 3, 4}
+
+
+def decisions(planner):
+    """Return what a planner decides for two robots, 20 times."""
+    memory, decided = planner.initial_memory(2), []
+    for _ in range(20):
+        moves, memory = planner.decide(np.zeros((2, 10, 10, 4), np.float32), memory)
+        decided.append(moves.tolist())
+    return decided

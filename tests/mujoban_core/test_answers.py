@@ -5,6 +5,7 @@ import pytest
 
 from bringup.evaluate import evaluate
 from mujoban_core.agent import Agent, AgentPolicy
+from mujoban_core.answers import ModuleError
 from mujoban_core.sense_plan_act import SensePlanAct
 from mujoban_sim.oracles import OracleController, OracleEstimator, OraclePlanner, OracleTermination
 from mujoban_sokoban.episodes import Episodes
@@ -44,12 +45,28 @@ def play(policy):
         ("planner", lambda a: a * 0 + 9, "planner decides 9 to 9: expected values of grid.Instruction, from 0 to 4"),
         ("planner", lambda a: a * 0 - 1, "planner decides -1 to -1: expected values of grid.Instruction"),
         ("planner", lambda a: a[0], r"planner.*\(\): expected \(2,\)"),
+        ("estimator", lambda _: None, r"estimator.*\(\): expected \(2, 10, 10, 4\)"),
+        ("termination", lambda p: p[0], r"termination.*\(\): expected \(2,\)"),
         ("controller", lambda a: a[0], r"torques of shape \(2,\): expected \(2, 2\)"),
     ],
 )
 def test_an_answer_that_is_none_is_refused_and_named(role, change, said):
     with pytest.raises(ValueError, match=said):
         play(answering(role, change))
+
+
+@pytest.mark.parametrize(("role", "method"), METHODS.items())
+def test_a_method_that_forgets_the_memory_is_named(role, method):
+    changed = type("Changed", (ORACLES[role],), {method: lambda self, *_: np.zeros(2)})
+    modules = {name: (changed if name == role else oracle)() for name, oracle in ORACLES.items()}
+    with pytest.raises(ValueError, match=f"{method} of the {role} returns ndarray: expected two, the answer and the n"):
+        play(SensePlanAct(**modules))
+
+
+@pytest.mark.parametrize("role", ORACLES)
+def test_an_error_within_a_module_names_its_role_and_is_no_bad_input(role):
+    with pytest.raises(ModuleError, match=f"the {role} has failed: operands could not be broadcast"):
+        play(answering(role, lambda _: np.zeros(3) + np.zeros(2)))
 
 
 def test_torques_of_one_robot_are_not_taken_for_all():

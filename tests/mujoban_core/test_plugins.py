@@ -2,6 +2,7 @@
 
 import re
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -20,6 +21,12 @@ from mujoban_core.plugins import ORACLE, PluginError, load_module, load_scout, s
 def test_a_class_that_cannot_be_made_without_arguments_is_named(source, message):
     with pytest.raises(PluginError, match=f"{re.escape(source)}: .*{message}.*expected a planner that is made without"):
         load_module("planner", source)
+
+
+@pytest.mark.parametrize("source", [ORACLE, "mujoban_sim.oracles:OraclePlanner"])
+def test_weights_are_refused_by_what_takes_none(source):
+    with pytest.raises(PluginError, match=rf"the planner {source} takes no weights, expected none; got mine\.safe"):
+        load_module("planner", source, Path("mine.safetensors"))
 
 
 def test_what_names_no_module_is_told_all_that_would():

@@ -272,8 +272,8 @@ def test_bad_arguments_are_named():
         World(0)
     with pytest.raises(ValueError, match="unknown body 'car'"):
         World(1, body="car")
-    for limit in (0, math.nan):
-        with pytest.raises(ValueError, match=f"time_limit is {limit}: expected at least 1 step"):
+    for limit in (0, math.nan, 2.5):
+        with pytest.raises(ValueError, match=f"time_limit is {limit}: expected a whole number of steps, at least 1"):
             World(1, time_limit=limit)
     world = World(2, max_boxes=1)
     with pytest.raises(ValueError, match=r"2 boxes.*max_boxes = 1"):
