@@ -197,9 +197,9 @@ class ImitationLearner(PlannerLearner[Batch]):
         self.config, self.device = config, usable_device(device)
         torch.manual_seed(config.seed)  # the initial weights
         self.network = beginning(config, config.init).to(self.device)
-        self._initial = [parameter.detach().clone() for parameter in self.network.parameters()]
+        self._initial = copy.deepcopy(self.network) if config.init_share else self.network
         self._average = moving_average(self.network, config.ema, warm_up=True)
-        self._between = copy.deepcopy(self._average.module)
+        self._product = copy.deepcopy(self._average.module) if config.init_share else self._average.module
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, (0.9, 0.98), weight_decay=config.weight_decay, fused=True
         )
@@ -209,14 +209,12 @@ class ImitationLearner(PlannerLearner[Batch]):
     @property
     def product(self) -> LearnedPlanner:
         """The moving average, or what lies between it and what it began with."""
-        share = self.config.init_share
-        if not share:
-            return self._average.module
-        parts = zip(self._between.parameters(), self._average.module.parameters(), self._initial, strict=True)
-        with torch.no_grad():
-            for between, average, initial in parts:
-                between.copy_(torch.lerp(average, initial, share))
-        return self._between
+        if share := self.config.init_share:
+            networks = (self._product, self._average.module, self._initial)
+            with torch.no_grad():
+                for between, average, initial in zip(*(n.parameters() for n in networks), strict=True):
+                    between.copy_(torch.lerp(average, initial, share))
+        return self._product
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
