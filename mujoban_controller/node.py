@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from mujoban_msgs.msg import Episode
 
-from mujoban_core.answers import answer_and_memory, check_torques
+from mujoban_core.answers import check_torques, torque_and_memory
 from mujoban_core.interfaces import Controller, ControllerInput, GroundTruth
 from mujoban_core.signals import leave
 from mujoban_msgs_py import topics
@@ -40,7 +40,7 @@ class ControllerNode(ModuleNode[Controller]):
             ),
             self.state,
         )
-        torque, self.state = answer_and_memory("step of the controller", said)
+        torque, self.state = torque_and_memory(said)
         if self.driven is not None:
             check_torques(torque, (1, self.driven.action_size))
         return self.say_torque(episode, torque[0])

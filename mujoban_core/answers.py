@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mujoban_core.grid import Instruction
+from mujoban_core.grid import CHANNELS, GRID_SIZE, Instruction
 
 
 class AnswerError(ValueError):
@@ -49,6 +49,26 @@ def answer_and_memory(method: str, said: Any) -> tuple[Any, Any]:
         what = f"{len(said)} values" if isinstance(said, tuple) else f"{type(said).__name__}"
         raise AnswerError(f"{method} returns {what}: expected two, the answer and the next memory")
     return said
+
+
+def estimate_and_memory(said: Any, robots: int) -> tuple[NDArray[np.float32], Any]:
+    """Return what an estimator's step has returned: probabilities, [M, N, N, 4], and the memory that comes after it.
+
+    Raises:
+        AnswerError: If it is anything else.
+    """
+    estimate, memory = answer_and_memory("step of the estimator", said)
+    check_probabilities("estimator", estimate, (robots, GRID_SIZE, GRID_SIZE, len(CHANNELS)))
+    return estimate, memory
+
+
+def torque_and_memory(said: Any) -> tuple[NDArray[np.float32], Any]:
+    """Return what a controller's step has returned: torques, which `check_torques` checks, and the memory after it.
+
+    Raises:
+        AnswerError: If it is not two values.
+    """
+    return answer_and_memory("step of the controller", said)
 
 
 def check_probabilities(role: str, values: NDArray[np.floating], shape: tuple[int, ...]) -> None:

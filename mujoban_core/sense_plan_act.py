@@ -8,9 +8,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoban_core.answers import answer_and_memory, answering, check_probabilities
+from mujoban_core.answers import answering, estimate_and_memory, torque_and_memory
 from mujoban_core.bodies import FIRST_PERSON_CAMERA
-from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.interfaces import (
     NO_INSTRUCTION,
     Controller,
@@ -102,13 +101,11 @@ class SensePlanAct:
             ValueError: If a module answers by what its role does not have.
             ModuleError: If one has failed.
         """
-        robots = len(obs.pose)
         with answering("estimator"):
             said = self.estimator.step(
                 EstimatorInput(obs.frame.copy(), obs.pose.copy(), self._truth_for("estimator", truth)), state.estimator
             )
-            estimate, estimator_state = answer_and_memory("step of the estimator", said)
-            check_probabilities("estimator", estimate, (robots, GRID_SIZE, GRID_SIZE, len(CHANNELS)))
+            estimate, estimator_state = estimate_and_memory(said, len(obs.pose))
         previous = np.where(state.planner.instruction < 0, NO_INSTRUCTION, state.planner.instruction)
         seen = TerminationInput(
             obs.frame.copy(), obs.proprio.copy(), previous, state.terminated, self._truth_for("termination", truth)
@@ -122,7 +119,7 @@ class SensePlanAct:
         )
         with answering("controller"):
             said = self.controller.step(told, state.controller)
-            torque, controller_state = answer_and_memory("step of the controller", said)
+            torque, controller_state = torque_and_memory(said)
         issued = planner_state.sequence != state.planner.sequence
         decision = Decision(estimate, beta, instruction, planner_state.sequence, issued, torque)
         return decision, PolicyState(

@@ -12,8 +12,7 @@ from typing import Any
 
 from mujoban_msgs.msg import Episode
 
-from mujoban_core.answers import answer_and_memory, check_shape
-from mujoban_core.grid import CHANNELS, GRID_SIZE
+from mujoban_core.answers import estimate_and_memory
 from mujoban_core.interfaces import Estimator, EstimatorInput, GroundTruth
 from mujoban_core.signals import leave
 from mujoban_msgs_py import conversions, topics
@@ -32,8 +31,7 @@ class EstimatorNode(ModuleNode[Estimator]):
         """Estimate the abstract state of one tick."""
         frame, pose = inputs[topics.CAMERA.name], inputs[topics.POSE.name]
         said = self.module.step(EstimatorInput(frame[None], pose[None], truth), self.state)
-        estimate, self.state = answer_and_memory("step of the estimator", said)
-        check_shape("the estimator gives probabilities", estimate, (1, GRID_SIZE, GRID_SIZE, len(CHANNELS)))
+        estimate, self.state = estimate_and_memory(said, 1)
         return self.say(episode, conversions.abstract_state_value(estimate[0]), conversions.abstract_state_to_msg)
 
 
