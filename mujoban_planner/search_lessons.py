@@ -88,6 +88,7 @@ class SearchConfig(LevelConfig, UncertaintyConfig):
     buffer: int = 200_000
     """Samples kept of each kind."""
     batch_size: int = 256
+    """Samples of an update."""
 
     def __post_init__(self) -> None:
         """Reject what is no number of its kind, and no share."""
