@@ -1,7 +1,8 @@
 """Compare two reports of the same levels: `python -m bringup.compare FIRST.json SECOND.json`.
 
 Reports are what `bringup/evaluate.py --json` writes. Each level that both played is a pair: what tells the two apart
-are the levels that only one of them solved. So the interval is narrower than those of the two rates.
+are the levels that only one of them solved. So the interval is narrower than those of the two rates. Copies of a level
+under other seeds, which most of difficulty 1 have, are one draw.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ if __name__ == "__main__":
     end_at_once()
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +23,8 @@ import tyro
 
 from bringup.results import counted
 from mujoban_core.program import read_options, run_command
-from mujoban_core.stats import paired_difference, sign_test
+from mujoban_core.stats import NORMAL_95, design_effect, paired_difference, sign_test
+from mujoban_sokoban.generator import generate_level
 
 PROG: Final = "bringup.compare"
 _LEVELS: Final = ("difficulty", "level_file_sha256")
@@ -54,15 +57,26 @@ def compare(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
         raise ValueError("the reports have no level in common: expected two of the same difficulty or file, and seeds")
     alone = [[seed for seed in levels if solved[a][seed] and not solved[1 - a][seed]] for a in (0, 1)]
     lost, won, n = len(alone[0]), len(alone[1]), len(levels)
-    mean, low, high = (100 * value for value in paired_difference(lost, won, n))
+    texts = [_level(played[0], seed) for seed in levels]
+    distinct = len(set(texts))
+    effect = design_effect([solved[1][seed] - solved[0][seed] for seed in levels], texts) if distinct < n else 1.0
+    mean, low, high = (100 * value for value in paired_difference(lost, won, n, NORMAL_95 * math.sqrt(effect)))
+    told = f"copies of a level are one draw, {distinct} are distinct"
+    if distinct == n:
+        told = f"sign test p = {sign_test(lost, won):.2g}"
     rates = [f"{100 * sum(one[seed] for seed in levels) / n:.1f} %" for one in solved]
     return [
         f"{n} levels in common: the first solved {rates[0]}, the second {rates[1]}",
         f"the first alone solved {counted(alone[0])}, the second alone {counted(alone[1])}",
-        f"the second less the first: {mean:+.1f} points (95 % interval {low:+.1f} to {high:+.1f}); sign test p = "
-        f"{sign_test(lost, won):.2g}",
+        f"the second less the first: {mean:+.1f} points (95 % interval {low:+.1f} to {high:+.1f}); {told}",
         *_otherwise(*played),
     ]
+
+
+def _level(played: Mapping[str, Any], seed: int) -> str:
+    """Return what tells a level from others: of a file that is its number."""
+    difficulty = played.get("difficulty")
+    return str(seed) if difficulty is None else generate_level(difficulty, seed).to_text()
 
 
 def _otherwise(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:

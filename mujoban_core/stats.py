@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from collections.abc import Hashable, Sequence
 from typing import Final
 
 NORMAL_95: Final = 1.959963984540054
@@ -35,6 +37,28 @@ def wilson_interval(successes: int, n: int, z: float = NORMAL_95) -> tuple[float
     return max(0.0, min(centre - half, rate)), min(1.0, max(centre + half, rate))
 
 
+def design_effect(outcomes: Sequence[float], clusters: Sequence[Hashable]) -> float:
+    """Return how many times the variance of a mean grows by trials of one cluster being alike (Kish 1965), at least 1.
+
+    Args:
+        outcomes: One number a trial, at least one.
+        clusters: The cluster of each.
+    """
+    mean = sum(outcomes) / len(outcomes)
+    sums: dict[Hashable, float] = defaultdict(float)
+    for outcome, cluster in zip(outcomes, clusters, strict=True):
+        sums[cluster] += outcome - mean
+    simple = sum((outcome - mean) ** 2 for outcome in outcomes)
+    if not simple:  # nothing is known of how much trials of a cluster differ: as if they did not
+        return len(outcomes) / len(sums)
+    return max(1.0, cluster_variance(list(sums.values())) / simple)
+
+
+def cluster_variance(sums: Sequence[float]) -> float:
+    """Return the variance of the sum of independent numbers whose mean is 0, one a cluster."""
+    return sum(value**2 for value in sums) * len(sums) / max(len(sums) - 1, 1)
+
+
 def rate_error(successes: int, n: int) -> float:
     """Return the standard error of a success rate, by the rule of succession: where all succeed it is not 0.
 
@@ -46,13 +70,14 @@ def rate_error(successes: int, n: int) -> float:
     return math.sqrt(expected * (1.0 - expected) / (n + 2))
 
 
-def paired_difference(lost: int, won: int, n: int) -> tuple[float, float, float]:
+def paired_difference(lost: int, won: int, n: int, z: float = NORMAL_95) -> tuple[float, float, float]:
     """Return the difference of two success rates on the same trials, with its 95 % interval (Agresti & Min 2005).
 
     Args:
         lost: Number of trials in which the first alone succeeded.
         won: Number of trials in which the second alone did.
         n: Number of trials, at least 1.
+        z: Standard normal quantile; the default gives 95 % coverage.
 
     Returns:
         Success rate of the second less that of the first; lower and upper bound. All in [-1, 1].
@@ -60,7 +85,7 @@ def paired_difference(lost: int, won: int, n: int) -> tuple[float, float, float]
     # Half a trial more in each cell of the table of both outcomes, so that the interval of no difference is no point.
     total, b, c = n + 2.0, lost + 0.5, won + 0.5
     centre = (c - b) / total
-    half = NORMAL_95 * math.sqrt(b + c - (c - b) ** 2 / total) / total
+    half = z * math.sqrt(b + c - (c - b) ** 2 / total) / total
     return (won - lost) / n, max(-1.0, centre - half), min(1.0, centre + half)
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Final, NamedTuple
 
 from benchmarks.paper.baselines import AGAIN, BASELINES, HOURS, MODULAR, Baseline, points_of, steps
 from benchmarks.paper.runs import load
-from mujoban_core.stats import NORMAL_95, wilson_interval
+from mujoban_core.stats import NORMAL_95, cluster_variance, design_effect, wilson_interval
 from mujoban_sokoban.generator import generate_level
 
 _FLOOR: Final = "untrained"
@@ -37,12 +37,9 @@ def interval(episodes: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
     Args:
         episodes: `seed` and `solved` of each, at difficulty 1.
     """
-    solved, n = sum(entry["solved"] for entry in episodes), len(episodes)
-    rate, shares = solved / n, _shares(episodes)
-    simple = rate * (1.0 - rate) / n
-    # Where all end alike nothing is known of how much copies differ: as if they did not.
-    effect = max(1.0, _variance(shares.values()) / simple) if simple else n / len(shares)
-    return wilson_interval(solved, n, NORMAL_95 * math.sqrt(effect))
+    outcomes = [entry["solved"] for entry in episodes]
+    effect = design_effect(outcomes, [_level(entry["seed"]) for entry in episodes])
+    return wilson_interval(sum(outcomes), len(outcomes), NORMAL_95 * math.sqrt(effect))
 
 
 def difference(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[str, Any]]) -> Difference:
@@ -55,7 +52,7 @@ def difference(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[str,
     ours, theirs = _shares(first), _shares(second)
     mean = sum(e["solved"] for e in first) / len(first) - sum(e["solved"] for e in second) / len(second)
     apart = [ours.get(level, 0.0) - theirs.get(level, 0.0) for level in ours.keys() | theirs.keys()]
-    half = NORMAL_95 * math.sqrt(_variance(apart))
+    half = NORMAL_95 * math.sqrt(cluster_variance(apart))
     return Difference(mean, mean - half, mean + half)
 
 
@@ -66,12 +63,6 @@ def _shares(episodes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     for entry in episodes:
         shares[_level(entry["seed"])] += (entry["solved"] - rate) / len(episodes)
     return shares
-
-
-def _variance(shares: Iterable[float]) -> float:
-    """Return the variance of the sum of independent shares whose mean is 0."""
-    found = list(shares)
-    return sum(share**2 for share in found) * len(found) / max(len(found) - 1, 1)
 
 
 @cache

@@ -8,6 +8,13 @@ import pytest
 from bringup import compare
 
 
+class FakeLevel(str):
+    """A level that is told apart by its text."""
+
+    def to_text(self):
+        return str(self)
+
+
 def report(path, solved, first=0, **played):
     episodes = [{"seed": first + i, "solved": bool(s)} for i, s in enumerate(solved)]
     path.write_text(json.dumps({"episodes": episodes, "played": {"difficulty": 3, "seed": first, **played}}))
@@ -27,6 +34,18 @@ def test_levels_that_only_one_solved_tell_two_reports_apart(tmp_path, capsys):
     assert alone == "the first alone solved 1 (seeds 4), the second alone 2 (seeds 2, 3)"
     expected = r"the second less the first: \+20\.0 points \(95 % interval -.* to \+.*\); sign test p = 1"
     assert re.fullmatch(expected, difference)
+
+
+def test_copies_of_a_level_are_one_draw(tmp_path, capsys, monkeypatch):
+    interval = r"95 % interval ([-+.\d]+) to ([-+.\d]+)\)(.*)"
+    solved = [0, 0, 1, 0, 0, 0] * 2, [1, 1, 1, 0, 0, 0] * 2
+    reports = [report(tmp_path / f"{i}.json", outcomes) for i, outcomes in enumerate(solved)]
+    low, high, told = re.search(interval, said(capsys, *reports)[-1]).groups()
+    monkeypatch.setattr(compare, "generate_level", lambda difficulty, seed: FakeLevel(str(seed // 2)))
+    wider_low, wider_high, copies = re.search(interval, said(capsys, *reports)[-1]).groups()
+    assert float(wider_low) < float(low) < float(high) < float(wider_high)
+    assert "sign test" in told
+    assert copies == "; copies of a level are one draw, 6 are distinct"
 
 
 def test_what_was_played_otherwise_is_named(tmp_path, capsys):
