@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -91,8 +93,9 @@ def test_lessons_and_bags_share_a_batch_and_resume_to_the_bit(bags, tmp_path, mo
 
 def test_what_is_no_share_is_refused():
     for config in (ImitationConfig, MPOConfig):
-        with pytest.raises(ValueError, match=r"--bag-share 1\.5"):
-            config(bag_share=1.5)
+        for share in (1.5, 0.0, math.nan):
+            with pytest.raises(ValueError, match=rf"--bag-share {share}: expected a share above 0, at most 1$"):
+                config(bag_share=share)
 
 
 @pytest.mark.parametrize("method", ["imitation", "mpo"])
