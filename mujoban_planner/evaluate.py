@@ -134,7 +134,8 @@ def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> d
     if options.optimal and solved.any():
         solutions = solve_batch(take_levels(levels, solved))
         known = solutions.status == Status.SOLVED
-        result["moves_over_optimal"] = float(moves[solved][known].sum() / solutions.length[known].sum())
+        if optimal := int(solutions.length[known].sum()):  # else none is known
+            result["moves_over_optimal"] = float(moves[solved][known].sum() / optimal)
     return result
 
 
