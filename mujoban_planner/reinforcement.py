@@ -75,10 +75,10 @@ class MoveStore(StepStore):
     def sample(self) -> MPOBatch:
         """Return a batch with n-step returns."""
         config = self._config
-        from_bags = 0 if self._bags is None else int(config.batch_size * self._share)
+        if self._bags is None:
+            return self._played(config.batch_size)
+        from_bags = max(1, int(config.batch_size * self._share))
         played = self._played(config.batch_size - from_bags)
-        if self._bags is None or not from_bags:
-            return played
         recorded = recorded_batch(self._bags, from_bags, config.discount, self.generator)
         return MPOBatch._make(torch.cat(columns) for columns in zip(played, recorded, strict=True))
 
