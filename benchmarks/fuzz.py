@@ -8,10 +8,8 @@ damaged, one bit or one cut each, and read: each must be refused by name, or hol
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -32,7 +30,7 @@ import mujoban_planner
 from benchmarks.command import run_benchmark
 from benchmarks.malformed import DEPTH, Vandal
 from benchmarks.malformed_calls import Caller
-from benchmarks.running import ROOT, family, megabytes
+from benchmarks.running import ROOT, end, family, megabytes, take_domain
 from bringup.run_stack import main as play
 from mujoban_msgs_py.bags import open_bag
 from mujoban_rl.weights import record_path
@@ -86,16 +84,15 @@ class Options:
 
 def attack(mode: str, options: Options) -> dict[str, Any]:
     """Return what became of a run that was attacked."""
-    os.environ["ROS_DOMAIN_ID"] = str(60 + os.getpid() % 40)
+    take_domain()
     command = [sys.executable, "bringup/run_stack.py", "--headless", "--episodes", "100000", *MODES[mode]]
     with tempfile.TemporaryFile("w+") as said:
         child = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said)
         try:
             report = {"mode": mode, **_Attack(child, options).report()}
         finally:
-            child.send_signal(signal.SIGINT)
-            child.wait(60)
-        report["status"] = child.returncode
+            status = end(child)
+        report["status"] = status
         said.seek(0)
         text = said.read()
     report["last_line"] = next(reversed(text.split("\n")[:-1]), "")

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.command import run_benchmark
+from benchmarks.timing import rate, work
 from mujoban_core.camera import FRAME_SIZE
 from mujoban_core.ranges import check_counts, check_positive
 from mujoban_sim.presets import DEFAULT_WORLD, EASED
@@ -70,14 +71,6 @@ def _default_renderer(world: World) -> Callable[[], int]:
     return draw
 
 
-def _rate(function: Callable[[], int], seconds: float) -> float:
-    """Return how many units a second a function that returns its units does."""
-    start, count = time.perf_counter(), 0
-    while time.perf_counter() - start < seconds:
-        count += function()
-    return count / (time.perf_counter() - start)
-
-
 def run(options: Options | None = None) -> dict[str, float]:
     """Measure rendering, by default with the default options.
 
@@ -105,9 +98,10 @@ def run(options: Options | None = None) -> dict[str, float]:
     rates: dict[str, list[float]] = {name: [] for name in contestants}
     for _ in range(chosen.rounds):
         for name, function in contestants.items():
-            rates[name].append(_rate(function, chosen.seconds))
+            rates[name].append(rate(function, chosen.seconds))
     result = {name: statistics.median(values) for name, values in rates.items()}
-    start, count = time.process_time(), _rate(contestants["frames_per_second"], chosen.seconds) * chosen.seconds
+    start = time.process_time()
+    count, _ = work(contestants["frames_per_second"], chosen.seconds)
     result["frames_per_cpu_second"] = count / (time.process_time() - start)
     others = {"default": "default_renderer_frames_per_second", "low_walls": "frames_per_second_low_walls"}
     for name, other in others.items():

@@ -18,6 +18,8 @@ from typing import Final, Self
 
 import psutil
 
+from mujoban_msgs_py.runtime.discovery import DOMAIN
+
 ROOT: Final = Path(__file__).parents[1]
 GIVE_UP: Final = 60.0
 """Seconds after which a command that does not end is killed."""
@@ -98,6 +100,21 @@ class Run:
             self._hung_up.set()
             self._reader.join()
             os.close(self._ours)
+
+
+def end(child: subprocess.Popen[bytes]) -> int:
+    """Interrupt a command and return its status; one that has not ended after `GIVE_UP` is killed."""
+    child.send_signal(signal.SIGINT)
+    try:
+        return child.wait(GIVE_UP)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        return child.wait()
+
+
+def take_domain() -> None:
+    """Name a ROS domain of its own to this process, and so to the run that it starts and looks at."""
+    os.environ[DOMAIN] = str(60 + os.getpid() % 40)
 
 
 def lives(process: psutil.Process) -> bool:

@@ -11,7 +11,6 @@ measured.
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -26,7 +25,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from benchmarks.command import run_benchmark
-from benchmarks.running import ROOT, family
+from benchmarks.running import ROOT, end, family, take_domain
 from mujoban_core.signals import StopSignal
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.runtime.shared_memory import FOLDER
@@ -122,7 +121,7 @@ def watch(options: Options, child: subprocess.Popen[bytes]) -> list[tuple[float,
 
 def measure(options: Options) -> dict[str, Any]:
     """Return the slopes."""
-    os.environ["ROS_DOMAIN_ID"] = str(60 + os.getpid() % 40)
+    take_domain()
     # More episodes than any number of hours holds.
     levels = ["--seed", str(VALIDATION_SEEDS.start), "--episodes", "1000000"]
     command = [sys.executable, "bringup/run_stack.py", "--headless", *levels, *MODES[options.mode]]
@@ -132,8 +131,7 @@ def measure(options: Options) -> dict[str, Any]:
         rows = watch(options, child)
     finally:
         survived = child.poll() is None
-        child.send_signal(signal.SIGINT)
-        child.wait(60)
+        end(child)
         rclpy.try_shutdown()
     return {"options": asdict(options), "survived": survived, "status": child.returncode, **summary(rows, options)}
 

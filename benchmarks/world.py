@@ -19,6 +19,7 @@ import numpy as np
 
 import mujoban_sim  # noqa: F401 - registers the environment
 from benchmarks.command import run_benchmark
+from benchmarks.timing import rate
 from mujoban_core.grid import xy_to_cell
 from mujoban_sim.scene import SceneCache
 from mujoban_sim.world import World
@@ -90,14 +91,6 @@ def _vector(actions: np.ndarray) -> Callable[[], int]:
     return advance
 
 
-def _rate(function: Callable[[], int], seconds: float) -> float:
-    """Return how many units a second a function that returns its units does."""
-    start, count = time.perf_counter(), 0
-    while time.perf_counter() - start < seconds:
-        count += function()
-    return count / (time.perf_counter() - start)
-
-
 def random_torques(steps: int, batch: int = 512, threads: int = THREADS) -> dict[str, float]:
     """Drive `batch` robots with random torques and count what leaves the free cells of its level.
 
@@ -147,10 +140,10 @@ def run(options: Options | None = None) -> dict[str, float]:
     rates: dict[str, list[float]] = {name: [] for name in contestants}
     for _ in range(options.rounds):
         for name, function in contestants.items():
-            rates[name].append(_rate(function, options.seconds))
+            rates[name].append(rate(function, options.seconds))
     result = {f"{name}_steps_per_second": statistics.median(values) for name, values in rates.items()}
     for name in ("env", "vector_env"):
-        ratios = [rate / plain for rate, plain in zip(rates[name], rates["plain"], strict=True)]
+        ratios = [ours / plain for ours, plain in zip(rates[name], rates["plain"], strict=True)]
         result[f"{name}_ratio"] = statistics.median(ratios)
     if options.random_steps:
         result |= random_torques(options.random_steps)

@@ -262,9 +262,10 @@ def oracle(role: str, body: str) -> Choice:
     return Choice(role, LEARNED, weights)
 
 
-def import_from_here(path: Sequence[str] = ("",)) -> None:
+def import_from_here() -> None:
     """Let `package.module:Class` name modules of the working directory, as `python -m` does."""
-    sys.path[:0] = [entry for entry in path if entry not in sys.path]
+    if "" not in sys.path:
+        sys.path.insert(0, "")
 
 
 def forget_command_line(command_line: Sequence[str] | None) -> None:

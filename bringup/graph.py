@@ -114,10 +114,11 @@ class InProcess:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Stop all nodes."""
-        for node in (*self._others, *self.nodes.values()):
-            self._remove(node)
-        self.executor.shutdown()
+        """Stop all nodes, also where one of them fails: each may have a file to finish."""
+        with ExitStack() as ends:
+            ends.callback(self.executor.shutdown)
+            for node in reversed((*self._others, *self.nodes.values())):
+                ends.callback(self._remove, node)
 
     def start(self, name: str) -> None:
         """Start a node of the graph."""

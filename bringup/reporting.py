@@ -109,7 +109,7 @@ class Reporting:
         self.results, self.figures = outcome.results, outcome.figures()
 
     def finish(self, results: Sequence[EpisodeResult], *, above: Table | None = None, **extra: Any) -> None:
-        """Write the report and print the summary.
+        """Write the report and print the summary; an interruption waits for that.
 
         Args:
             results: The episodes.
@@ -118,7 +118,13 @@ class Reporting:
 
         Raises:
             OSError: If it cannot be written.
+            Interrupted: If the process was asked to end meanwhile.
         """
+        with StopSignal() as stop:
+            self._tell(results, above, extra)
+        stop.check()
+
+    def _tell(self, results: Sequence[EpisodeResult], above: Table | None, extra: Mapping[str, Any]) -> None:
         self.results = ()  # they are told
         content = report(results, self._weights, **self._game, **extra)
         if self._generated:
@@ -142,4 +148,4 @@ class Reporting:
         if isinstance(value, KeyboardInterrupt | SystemExit | Exception) and self.results:
             with StopSignal():
                 played = sorted(self.results, key=lambda result: result.seed)
-                self.finish(played, interrupted=self._asked, **self.figures)
+                self._tell(played, None, {"interrupted": self._asked, **self.figures})

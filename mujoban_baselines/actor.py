@@ -29,9 +29,9 @@ COMPACT: Final = {"abstract_state": np.bool_}
 """Types in which sights are kept, where they are not those of the simulator."""
 
 
-def memory_of(batch: Mapping[str, Tensor], tick: int = 0) -> Recurrent:
-    """Return the memory with which an agent went into a tick of sequences [M, L, ...]."""
-    return Recurrent(*(batch[name][:, tick] for name in MEMORY_FIELDS))
+def memory_of(batch: Mapping[str, Tensor]) -> Recurrent:
+    """Return the memory with which an agent went into sequences [M, L, ...]."""
+    return Recurrent(*(batch[name][:, 0] for name in MEMORY_FIELDS))
 
 
 class AgentActor(Actor):

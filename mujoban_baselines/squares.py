@@ -100,16 +100,18 @@ class SquaresTask(Task):
         return (places * GRID_SIZE / 2).astype(np.float32)
 
     def step(self, torque: NDArray[np.float32]) -> TaskStep:
-        """Walk by up to `_SPEED` in x and y."""
+        """Walk by up to `_SPEED` in x and y; whose episode has ended stands still, without reward, as in the world."""
         walker = self._places["walker"]
         before = self._distance()
-        walker[:] = (walker + _SPEED * torque).clip(-1.0, 1.0)
-        self._age += 1
+        # Whose age is 0 may have the outcome of the episode before.
+        on = (self._age < _LIMIT) & ((self._outcome == 0.0) | (self._age == 0))
+        walker[:] = (walker + _SPEED * torque * on[:, None]).clip(-1.0, 1.0)
+        self._age += on
         # Shape [2, B].
         near = np.stack([(np.abs(self._places[name] - walker) < _NEAR).all(1) for name in ("goal", "decoy")])
         self._outcome[:] = near[0].astype(np.float32) - near[1]
         terminated = near[0] | near[1]
-        reward = (self._outcome + before - self._distance()).astype(np.float32)
+        reward = (self._outcome * on + before - self._distance()).astype(np.float32)
         return TaskStep(reward, terminated, (self._age >= _LIMIT) & ~terminated)
 
     def _distance(self) -> NDArray[np.float64]:

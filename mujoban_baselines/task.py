@@ -63,7 +63,7 @@ class Task(ABC):
 
     @abstractmethod
     def step(self, torque: NDArray[np.float32]) -> TaskStep:
-        """Apply torques in [-1, 1], [B, U], for one step."""
+        """Apply torques in [-1, 1], [B, U], for one step; whose episode has ended stands still, without reward."""
 
     @abstractmethod
     def renew(self, rows: NDArray[np.int64]) -> dict[str, list[float]]:

@@ -198,11 +198,11 @@ def abstract_state_value(state: NDArray[np.floating[Any]]) -> NDArray[np.float32
     return state.astype(np.float32)
 
 
-def abstract_state_from_msg(message: AbstractState, size: int | None = GRID_SIZE) -> NDArray[np.float32]:
-    """Return probabilities [rows, columns, 4]; rows = columns = `size` unless that is None."""
+def abstract_state_from_msg(message: AbstractState) -> NDArray[np.float32]:
+    """Return probabilities [N, N, 4], N = `grid.GRID_SIZE`."""
     rows, cols = message.rows, message.cols
-    if size is not None and (rows, cols) != (size, size):
-        raise ConversionError(f"abstract state must have {size}x{size} cells, got {rows}x{cols}")
+    if (rows, cols) != (GRID_SIZE, GRID_SIZE):
+        raise ConversionError(f"abstract state must have {GRID_SIZE}x{GRID_SIZE} cells, got {rows}x{cols}")
     state = np.empty((rows, cols, len(CHANNELS)), np.float32)
     for channel, name in enumerate(CHANNELS):
         layer = np.frombuffer(getattr(message, name), np.float32)

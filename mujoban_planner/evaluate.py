@@ -134,7 +134,8 @@ def evaluate(planner: LearnedPlanner, levels: LevelBatch, options: Options) -> d
     if options.optimal and solved.any():
         solutions = solve_batch(take_levels(levels, solved))
         known = solutions.status == Status.SOLVED
-        result["moves_over_optimal"] = float(moves[solved][known].sum() / solutions.length[known].sum())
+        if optimal := int(solutions.length[known].sum()):  # else none is known
+            result["moves_over_optimal"] = float(moves[solved][known].sum() / optimal)
     return result
 
 
@@ -150,6 +151,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         how = {name: result[name] for name in ("difficulty", "thinking", "caution", "look_ahead")}
         seeds = range(options.seed, options.seed + options.episodes)
         result |= noted_use(seeds, result["weights"], {"program": PROG, **how})
+    keep_report(result, options.json)  # before anything is printed, which nobody may read any more
     low, high = result["success_interval"]
     print(f"success rate          {result['success_rate']:.4f}  [{low:.4f}, {high:.4f}]  n = {result['n']}")
     if "moves_over_optimal" in result:
@@ -157,7 +159,6 @@ def main(command_line: Sequence[str] | None = None) -> int:
     print(f"decisions per second  {result['decisions_per_second']:.0f}")
     if options.look_ahead:
         print(f"evaluations per level {result['evaluations_per_level']:.1f}  (at most {options.look_ahead} per search)")
-    keep_report(result, options.json)
     return 0
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mujoban_core.bodies import Body, get_body
-from mujoban_core.grid import Instruction
+from mujoban_core.grid import DIFFICULTIES, Instruction
 from mujoban_core.look_around import WALKS, Scout, ScriptedScout
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import abstract_states
@@ -121,15 +121,13 @@ class ExplorerActor(SequenceActor):
         return {**kept, "terminated": step.complete, "dropped": cut}, {"reward": step.reward.tolist()}
 
 
-def judge_scout(
-    scout: Scout, reward: ExplorationReward, levels: int, body: Body, difficulty: int = 5
-) -> dict[str, float]:
+def judge_scout(scout: Scout, reward: ExplorationReward, levels: int, body: Body) -> dict[str, float]:
     """Let a scout of a body explore validation levels; return averages over them.
 
     `found` is the share of what can be seen and the first turn has not shown; `steps` and `looks` are the instructions
     of an episode, `reward` their return.
     """
-    states = abstract_states(validation_levels(difficulty, levels))
+    states = abstract_states(validation_levels(max(DIFFICULTIES), levels))
     environment = ExplorationEnvironment(states, np.random.default_rng(0), body, reward)
     hidden, going = environment.remaining, np.ones(levels, np.bool_)
     left = hidden.copy()

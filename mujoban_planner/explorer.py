@@ -81,7 +81,8 @@ class Explorer(nn.Module, Scout):
     @torch.inference_mode()
     def step(self, abstract_state: NDArray[np.float32], shown: NDArray[np.bool_]) -> Instruction | None:
         """Return the likeliest instruction, None where it is not worth its cost; see `Scout.step`."""
-        policy, q = self(torch.from_numpy(observe_estimate(abstract_state, shown, self._body))[None])
+        state = torch.from_numpy(observe_estimate(abstract_state, shown, self._body))[None]
+        policy, q = self(state.to(self.step_cost.device))
         best = int(policy.argmax())
         return Instruction(best) if q[0, best] > 0.0 else None
 

@@ -19,7 +19,7 @@ import torch
 from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive
-from mujoban_msgs_py.bags.training import bags_digest
+from mujoban_msgs_py.bags.training import bags_digest, check_share_of_bags
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.discrete_mpo import MPOBatch, StepStore
 from mujoban_planner.growth import beginning
@@ -61,8 +61,7 @@ class MPOConfig(MoveConfig, NetworkConfig):
         check_positive(self, "cpu_seconds")
         check_not_negative(self, "anchor")
         check_counts(self, "critic_first", least=0)
-        if not 0.0 < self.bag_share <= 1.0:
-            raise ValueError(f"--bag-share {self.bag_share}: expected a share above 0, at most 1")
+        check_share_of_bags(self.bag_share)
 
 
 class MoveStore(StepStore):
@@ -76,10 +75,10 @@ class MoveStore(StepStore):
     def sample(self) -> MPOBatch:
         """Return a batch with n-step returns."""
         config = self._config
-        from_bags = 0 if self._bags is None else int(config.batch_size * self._share)
+        if self._bags is None:
+            return self._played(config.batch_size)
+        from_bags = max(1, int(config.batch_size * self._share))
         played = self._played(config.batch_size - from_bags)
-        if self._bags is None or not from_bags:
-            return played
         recorded = recorded_batch(self._bags, from_bags, config.discount, self.generator)
         return MPOBatch._make(torch.cat(columns) for columns in zip(played, recorded, strict=True))
 

@@ -99,8 +99,10 @@ def judged(product: nn.Module) -> Iterator[None]:
     """Have a product in evaluation mode meanwhile, as it plays where it is used."""
     training = product.training
     product.eval()
-    yield
-    product.train(training)
+    try:
+        yield
+    finally:
+        product.train(training)
 
 
 class JudgedLearner(Learner[BatchT]):

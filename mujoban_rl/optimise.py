@@ -24,7 +24,6 @@ def guarded_step(
     guard: NaNGuard,
     *,
     clip: float = math.inf,
-    clipped: Iterable[nn.Parameter] | None = None,
     part: str = "",
 ) -> Tensor | None:
     """Step all optimisers along the gradient of a loss, or none of them if a number is not finite.
@@ -33,8 +32,7 @@ def guarded_step(
         loss: Scalar.
         optimisers: Every optimiser with a parameter in the loss, those of dual variables too.
         guard: Decides.
-        clip: Largest norm of the gradient of `clipped`.
-        clipped: Parameters that are clipped together; those of the first optimiser by default.
+        clip: Largest norm of the gradient of the first optimiser's parameters, which are clipped together.
         part: Which step of an update, where it has several; see `NaNGuard.accept`.
 
     Returns:
@@ -43,7 +41,7 @@ def guarded_step(
     for optimiser in optimisers:
         optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    return step_if_finite(loss, optimisers, guard, clip=clip, clipped=clipped, part=part)
+    return step_if_finite(loss, optimisers, guard, clip=clip, part=part)
 
 
 def step_if_finite(
@@ -55,7 +53,10 @@ def step_if_finite(
     clipped: Iterable[nn.Parameter] | None = None,
     part: str = "",
 ) -> Tensor | None:
-    """Step all optimisers along the gradients that their parameters have; see `guarded_step`."""
+    """Step all optimisers along the gradients that their parameters have; see `guarded_step`.
+
+    Clipped together are the parameters `clipped`, where they are given in place of the first optimiser's.
+    """
     first = list(clipped) if clipped is not None else _parameters(optimisers[:1])
     known = {id(p) for p in first}
     others = [p.grad for p in _parameters(optimisers) if id(p) not in known and p.grad is not None]

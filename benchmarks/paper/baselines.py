@@ -283,7 +283,7 @@ def _stretches(lines: Sequence[dict[str, Any]], longest: int) -> list[tuple[Sequ
     steps = np.array([line["step"] for line in lines])
     together = longest * max(1, math.ceil((steps[-1] / longest - 1) / _MOST))
     # The line in which an episode ends may be one of steps after it.
-    edges = np.searchsorted(steps, np.arange(longest, steps[-1] + 1, together)) + 1
+    edges = np.unique(np.searchsorted(steps, np.arange(longest, steps[-1] + 1, together)) + 1)
     parts = [part for part in np.split(np.array(lines, object), edges) if len(part)]
     return [(list(part), 0 < i < len(edges)) for i, part in enumerate(parts)]
 

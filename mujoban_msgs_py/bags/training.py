@@ -69,6 +69,16 @@ def open_training_bag(path: Path, wanted: Sequence[Topic], *, skip_damaged: bool
     return bag
 
 
+def check_share_of_bags(share: float) -> None:
+    """Refuse to take nothing of a batch from bags, or more than all of it.
+
+    Raises:
+        ValueError: If it is no share, or 0.
+    """
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f"--bag-share {share}: expected a share above 0, at most 1")
+
+
 def check_bag_share(share: float, default: float, bags: Sequence[Path]) -> None:
     """Refuse to take another share than the default one from no bags.
 

@@ -14,7 +14,7 @@ from rosgraph_msgs.msg import Clock
 
 from mujoban_msgs_py.bags import Bag, BagMessage, TopicInfo, open_bag
 from mujoban_msgs_py.conversions import clock_to_msg
-from mujoban_msgs_py.ros2.session import CommandError, Session, full_name, import_type, make_qos
+from mujoban_msgs_py.ros2.session import CommandError, Session, check_rate, full_name, import_type, make_qos
 from mujoban_msgs_py.ros2.verbs import Verbs
 
 MATCH_LIMIT: Final = 5.0
@@ -125,8 +125,7 @@ def _qos(topic: TopicInfo) -> QoSProfile:
 
 def play(options: argparse.Namespace) -> int:
     """Play a bag."""
-    if options.rate <= 0:
-        raise CommandError(f"--rate must be greater than zero, got {options.rate}")
+    check_rate(options.rate)
     bag = open_bag(options.bag_path)
     with Session(options) as session:
         player = Player(session, bag, options)

@@ -13,6 +13,7 @@ from mujoban_msgs_py.ros2.session import (
     CommandError,
     Session,
     add_discovery_options,
+    check_rate,
     full_name,
     import_type,
     is_hidden,
@@ -90,8 +91,8 @@ def _await(session: Session, client: Client, kind: str) -> None:
 
 def call(options: argparse.Namespace) -> int:
     """Call a service and print the response."""
-    if options.rate is not None and options.rate <= 0:
-        raise CommandError(f"--rate must be greater than zero, got {options.rate}")
+    if options.rate is not None:
+        check_rate(options.rate)
     kind: Any = import_type(options.service_type, "srv")
     name = full_name(options.service_name)
     values = parse_values(options.values)

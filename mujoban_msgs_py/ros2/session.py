@@ -205,6 +205,16 @@ def import_type(name: str, kind: str) -> type[Any]:
         raise CommandError(f"the type '{name}' is unknown: no installed package has it") from None
 
 
+def check_rate(rate: float) -> None:
+    """Refuse a rate, as --rate gives it, by which nothing would ever come.
+
+    Raises:
+        CommandError: If it is not greater than zero, or no number.
+    """
+    if not rate > 0:
+        raise CommandError(f"--rate must be greater than zero, got {rate}")
+
+
 def add_discovery_options(parser: argparse.ArgumentParser) -> None:
     """Add the options about discovery that the genuine command has."""
     parser.add_argument(

@@ -9,10 +9,10 @@ from builtin_interfaces.msg import Time
 
 from mujoban_msgs_py.ros2.messages import fill, parse_values
 from mujoban_msgs_py.ros2.session import (
-    CommandError,
     Session,
     add_discovery_options,
     add_qos_options,
+    check_rate,
     choose_qos,
     full_name,
     import_type,
@@ -45,8 +45,7 @@ def add_verb(verbs: Verbs) -> None:
 
 def publish(options: argparse.Namespace) -> int:
     """Publish a message, once, several times or until interrupted."""
-    if options.rate <= 0:
-        raise CommandError(f"--rate must be greater than zero, got {options.rate}")
+    check_rate(options.rate)
     kind = import_type(options.message_type, "msg")
     values = parse_values(options.values)
     fill(kind(), values, Time())  # what does not fit is refused before anybody is waited for

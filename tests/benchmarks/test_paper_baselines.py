@@ -72,6 +72,16 @@ def test_a_curve_counts_no_episodes_but_of_whole_spans_of_the_longest_one(tmp_pa
     assert points[-1]["cpu_seconds"] == 480, "what it cost is of the whole run"
 
 
+def test_lines_further_apart_than_the_longest_episode_leave_the_end_out_too(tmp_path):
+    task = {"levels": "easy", "episode_seconds": 4.5, "robots": 2, "body": "ball", "world": "reference"}
+    (tmp_path / "config.json").write_text(json.dumps({"task": task}))
+    one = {f"{kind}/1{suffix}": 1.0 for kind in ("solved", "return") for suffix in ("", "_n")}
+    lines = [{"step": step, "cpu_seconds": step, "seconds": step, **one} for step in (180, 720, 900, 960)]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    points = baselines.read_curve(tmp_path)
+    assert [point["episodes"].get("1", 0) for point in points] == [0, 1, 1, 0]
+
+
 def test_bars_of_a_curve_are_intervals_of_its_episodes():
     points = [{"step": 1, "solved": {"1": 0.75}, "episodes": {"1": 20}}]
     ((below, above),) = baselines.solved_margins(points, 1)

@@ -23,6 +23,7 @@ from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.listening import ANOTHER_RUN
 from mujoban_msgs_py.run_identifier import run_of
 from mujoban_msgs_py.runtime import diagnostics
+from mujoban_msgs_py.runtime.graph_node import GraphNode
 from mujoban_msgs_py.topics import TICK
 from mujoban_sokoban.episodes import Episodes
 
@@ -211,6 +212,17 @@ def test_a_module_that_answers_by_another_shape_ends_the_graph_and_is_named(play
     graph = play_graph(Stack(oracles.choices | {role: Choice(role, f"misfits:{misfit}")}))
     with pytest.raises(ValueError, match=said):
         graph.finish()
+
+
+def test_a_node_that_cannot_finish_its_file_keeps_no_other_from_it(ros, oracles):
+    class FullDisk(GraphNode):
+        def destroy_node(self):
+            super().destroy_node()
+            raise OSError("the disk is full")
+
+    with pytest.raises(OSError, match="disk"), InProcess(graph_parameters(oracles, Episodes(1, 47)), ()) as graph:
+        bag, film = graph.add(FullDisk("bag")), graph.add(GraphNode("film"))
+    assert bag.ended and film.ended
 
 
 def test_a_process_that_answers_no_tick_is_given_up_after_a_few_starts(ros, oracles, monkeypatch):

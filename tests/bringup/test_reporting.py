@@ -1,6 +1,7 @@
 """Reports of evaluations and runs: what they say, when they are written, and where."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from unittest.mock import Mock
 import pytest
 from commands import ALL_ORACLES, UNSOLVABLE, run
 
-from bringup import evaluate, run_stack, stack
+from bringup import evaluate, reporting, run_stack, stack
 from bringup.command import Stack
 from bringup.graph import InProcess
 from bringup.options import EpisodeOptions
@@ -181,6 +182,21 @@ def test_a_report_is_written_though_nobody_reads_its_summary_any_more(tmp_path, 
     with pytest.raises(BrokenPipeError):
         reporting.finish([EpisodeResult(1000, True, 11.0, 5, 1, 0, 0, None)])
     assert json.loads((tmp_path / "report.json").read_text())["test_uses"][0]["seeds"] == [1000, 1000]
+
+
+def test_an_interruption_at_the_end_waits_for_the_report(tmp_path, monkeypatch, capfd):
+    def late(content, path, keep=reporting.keep_report):
+        os.kill(os.getpid(), signal.SIGINT)
+        keep(content, path)
+
+    monkeypatch.setattr(reporting, "keep_report", late)
+    path, episodes = tmp_path / "report.json", Episodes(1, 1000)
+    with pytest.raises(KeyboardInterrupt):
+        Reporting(path, {}, episodes, played(Stack(), episodes, EpisodeOptions())).finish(
+            [EpisodeResult(1000, True, 11.0, 5, 1, 0, 0, None)]
+        )
+    assert json.loads(path.read_text())["success_rate"] == 1.0 and "interrupted" not in json.loads(path.read_text())
+    assert "solved 1 of 1" in capfd.readouterr().out
 
 
 def test_of_a_file_only_the_levels_that_are_played_are_looked_through(tmp_path, monkeypatch, capsys):

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -27,7 +28,14 @@ def test_extrinsics_are_those_of_the_camera_that_the_body_carries(pose):
     transform = camera_extrinsics(BALL.camera, pose)
     np.testing.assert_allclose(transform[:3, :3], rotation, atol=1e-6)
     np.testing.assert_allclose(transform[:3, 3], -rotation @ data.cam_xpos[camera], atol=1e-6)
+    assert transform.shape == (4, 4) and transform[3].tolist() == [0.0, 0.0, 0.0, 1.0]
     assert model.cam_fovy[camera] == BALL.camera.fovy
+
+
+def test_the_intrinsics_are_those_of_a_frame_whose_pixels_have_whole_numbers_at_their_centres():
+    # As ROS has it (sensor_msgs/CameraInfo): the edges of 64 pixels are at -0.5 and 63.5, half of 90 degrees from 31.5.
+    found = camera_intrinsics(replace(BALL.camera, fovy=90.0), 64)
+    np.testing.assert_allclose(found, [[32.0, 0.0, 31.5], [0.0, 32.0, 31.5], [0.0, 0.0, 1.0]])
 
 
 @given(poses, points)

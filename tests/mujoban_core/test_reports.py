@@ -60,6 +60,7 @@ def test_parts_of_an_evaluation_are_one_use_and_each_further_look_at_a_level_is_
     assert count_uses([]) == 0 and count_uses(halves) == 1
     assert count_uses([*halves, use(0, 3)]) == 1, "an entry that is there twice"
     assert count_uses([*halves, use(0, 3, when="later")]) == 2
+    assert count_uses([*halves, use(4, 7, when="later")]) == 2
     assert count_uses([*halves, use(3, 4, commit="e")]) == 2
     assert count_uses([*halves, use(8, 9, planner="b")]) == 2
     assert count_uses([*halves, use(8, 9, played={"difficulty": 4})]) == 2

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -13,8 +15,9 @@ from mujoban_core.program import exit_status
 from mujoban_msgs_py.bags import BagError
 from mujoban_planner import train
 from mujoban_planner.bag_lessons import BagLessons, Lessons
+from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.imitation import ImitationConfig, imitation
-from mujoban_planner.reinforcement import MPOConfig, reinforcement
+from mujoban_planner.reinforcement import MoveStore, MPOConfig, reinforcement
 from mujoban_rl.testing import check_resuming
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
 from mujoban_sokoban.solver import solve_level
@@ -89,10 +92,24 @@ def test_lessons_and_bags_share_a_batch_and_resume_to_the_bit(bags, tmp_path, mo
     assert trainers[0].progress.samples == 4 * 16
 
 
+@pytest.mark.parametrize(("share", "expected"), [(0.05, 1), (0.25, 2), (0.9, 7)])
+def test_a_batch_has_its_share_of_recorded_transitions_and_one_at_least(share, expected):
+    config = MPOConfig(environments=2, replay_steps=16, play=8, n_step=1, batch_size=8, bag_share=share)
+    state = torch.zeros(3, 10, 10, 4)
+    reward, no = torch.full((3,), 5.0), torch.zeros(3, dtype=torch.bool)
+    store = MoveStore(config, BagTransitions(state, torch.ones(3, dtype=torch.int64), reward, state, no))
+    played = {"reward": np.zeros((9, 2), np.float32), "instruction": np.zeros((9, 2), np.int64)}
+    played |= {name: np.zeros((9, 2), np.bool_) for name in ("terminated", "dropped")}
+    store.replay.add({**played, "state": np.zeros((9, 2, 10, 10, 4), np.float32)})
+    batch = store.sample()
+    assert len(batch.reward) == 8 and int((batch.reward == 5.0).sum()) == expected
+
+
 def test_what_is_no_share_is_refused():
     for config in (ImitationConfig, MPOConfig):
-        with pytest.raises(ValueError, match=r"--bag-share 1\.5"):
-            config(bag_share=1.5)
+        for share in (1.5, 0.0, math.nan):
+            with pytest.raises(ValueError, match=rf"--bag-share {share}: expected a share above 0, at most 1$"):
+                config(bag_share=share)
 
 
 @pytest.mark.parametrize("method", ["imitation", "mpo"])

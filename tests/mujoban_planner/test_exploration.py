@@ -146,6 +146,20 @@ def test_an_explorer_of_any_body_is_trained_and_scouts_for_that_body_alone(tmp_p
         load_scout(LEARNED, weights, body="ball")
 
 
+def test_a_scout_takes_what_it_sees_to_the_device_of_its_network(environment):
+    explorer, seen = Explorer(8, 1).to("meta"), environment.observe()[0]
+
+    class Reached(Exception):
+        pass
+
+    def look(module, inputs):
+        raise Reached(inputs[0].device.type)
+
+    explorer.register_forward_pre_hook(look)
+    with pytest.raises(Reached, match="meta"):
+        explorer.step(seen[..., :SHOWN], seen[..., SHOWN] > 0.5)
+
+
 def test_a_learned_scout_without_weights_says_that_none_ship():
     with pytest.raises(PluginError, match=r"learned scout: none of its weights ship, expected some \(\.safe"):
         load_scout(LEARNED)

@@ -1,5 +1,7 @@
 import json
+import sys
 from functools import partial
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -268,6 +270,20 @@ def test_evaluate_reports_rate_interval_and_optimality(tmp_path, capsys):
     assert low <= result["success_rate"] <= high
     assert result["moves_over_optimal"] >= 1.0
     assert "success rate" in capsys.readouterr().out
+
+
+def test_levels_of_which_no_optimal_solution_is_known_say_nothing_of_optimality(monkeypatch):
+    monkeypatch.setattr(evaluate, "solve_batch", partial(evaluate.solve_batch, max_nodes=1))
+    figures = evaluate.evaluate(load(), generate_batch(1, range(4)), evaluate.Options())
+    assert figures["success_rate"] > 0.0 and "moves_over_optimal" not in figures
+
+
+def test_what_was_evaluated_is_kept_though_nobody_reads_it_any_more(tmp_path, monkeypatch):
+    out = tmp_path / "out.json"
+    monkeypatch.setattr(sys.stdout, "write", Mock(side_effect=BrokenPipeError))
+    with pytest.raises(BrokenPipeError):
+        evaluate.main(["--difficulty", "1", "--episodes", "2", "--seed", "1000", "--json", str(out)])
+    assert json.loads(out.read_text())["test_uses"][0]["seeds"] == [1000, 1001]
 
 
 @pytest.mark.parametrize(

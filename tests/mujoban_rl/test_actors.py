@@ -168,7 +168,8 @@ def test_a_run_from_a_light_copy_plays_no_stream_twice(tmp_path, pool):
     second = trainer(tmp_path / "there", pool(Walkers(), 2))
     assert second.run() and {stream for stream, _ in second.source.store.origins} == {2, 3}
     lines = map(json.loads, (tmp_path / "there" / "metrics.jsonl").read_text().splitlines())
-    assert all(line["actors/staleness"] >= 0 for line in lines if "actors/staleness" in line)
+    stale = [line["actors/staleness"] for line in lines if line.get("actors/staleness") is not None]
+    assert stale and min(stale) >= 0
 
 
 def test_a_signal_to_the_whole_group_leaves_the_learner_what_its_actors_play(tmp_path):

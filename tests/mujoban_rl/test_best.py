@@ -1,10 +1,11 @@
 import math
 
+import pytest
 import torch
 from torch import nn
 
 from mujoban_core.stats import rate_error
-from mujoban_rl.best import Best
+from mujoban_rl.best import Best, judged
 
 
 def product(value):
@@ -52,6 +53,14 @@ def test_without_a_judgement_the_present_product_is_the_best():
     best.restore(best.state())
     torch.testing.assert_close(dict(best.chosen(present).state_dict()), dict(present.state_dict()))
     assert best.told == {"validation": None, "evaluation": None}
+
+
+def test_an_evaluation_that_fails_leaves_the_product_in_training():
+    learned = product(1.0)
+    with pytest.raises(KeyboardInterrupt), judged(learned):
+        assert not learned.training
+        raise KeyboardInterrupt
+    assert learned.training
 
 
 def test_a_score_that_is_not_a_number_is_never_the_best():

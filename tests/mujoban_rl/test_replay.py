@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from mujoban_rl.replay import SequenceBuilder, SequenceReplay
+from mujoban_rl.replay import SequenceBuilder, SequenceReplay, TickReplay, steps_per_update
 
 
 def filled(replay, builder, ticks, rows=3):
@@ -22,6 +22,25 @@ def test_windows_are_successive_ticks_of_one_environment_and_begin_at_every_tick
     assert starts.tolist() == [row * 1000 + tick for row in range(3) for tick in range(36, 60)]
     assert counts.min() > 60 and counts.max() < 140
     assert replay.sample(2, torch.Generator())["frame"].shape == (2, 8, 2)
+
+
+@pytest.mark.parametrize(("length", "starts"), [(8, range(30)), (4, range(0, 36, 4))])
+def test_windows_of_ticks_begin_at_every_tick_also_where_a_sequence_ends(length, starts):
+    replay = TickReplay(12, length, window=4)
+    for tick in range(36):
+        replay.add({"value": np.array([tick])})
+    window = replay.sample(3300, torch.Generator().manual_seed(0))["value"]
+    assert torch.equal(window[:, 1:], window[:, :-1] + 1)
+    found, counts = np.unique(window[:, 0].numpy(), return_counts=True)
+    # Of eight ticks, the sixth sequence ends at tick 32, and what follows waits for the seventh.
+    assert found.tolist() == list(starts)
+    assert counts.min() > 0.6 * counts.mean() and counts.max() < 1.4 * counts.mean()
+
+
+def test_each_step_is_learned_from_as_often_as_is_asked_for():
+    windows, ticks, reuse, updates = 8, 5, 2.5, 100
+    steps = updates * steps_per_update(windows, ticks, reuse)
+    assert updates * windows * ticks == reuse * steps
 
 
 def test_a_replay_and_a_builder_go_on_where_they_were():
