@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -177,12 +177,14 @@ class Pipeline:
 
         Raises:
             PipelineError: If a command fails or does not make what it should; the others are stopped. Or if another
-                process runs the stages of this directory, or what a stage needs was changed since it was made.
+                process runs the stages of this directory, what a stage needs was changed since it was made, or what it
+            would make anew is there already and not of this run.
             Interrupted: If a signal came; the commands were stopped and have kept their checkpoints.
         """
         with self.alone(), StopSignal() as stop:
             self._redo_what_is_gone()
             self._check_what_is_needed()
+            self._check_what_would_be_removed()
             try:
                 while not self.done:
                     stop.check()
@@ -229,6 +231,17 @@ class Pipeline:
                         f"expected {brief(expected)}; or remove it, and it is made again"
                     )
 
+    def _check_what_would_be_removed(self) -> None:
+        """Check that what a stage removes before it starts was made by itself, and not by somebody else."""
+        for stage in self.stages:
+            if stage.resumes or self.entries[stage.name].ran_with:
+                continue
+            if there := [path for path in stage.products if path.exists()]:
+                raise PipelineError(
+                    f"{there[0]}: is there already, but not of this run, whose stage {stage.name} makes it anew; "
+                    "expected none: move it away, or remove it"
+                )
+
     def _start_ready(self) -> None:
         done = {name for name, entry in self.entries.items() if entry.done}
         for stage in self._ready(done, self.running()):
@@ -266,23 +279,31 @@ class Pipeline:
         self._running[stage.name] = (process, time.monotonic())
 
     def _reap(self) -> None:
+        """Note stages that have ended, all of them before one that failed is complained of."""
+        failed: PipelineError | None = None
         for stage in self.stages:
-            if stage.name not in self._running:
-                continue
-            code = self._running[stage.name][0].poll()
-            if code is None:
+            if stage.name not in self._running or (code := self._running[stage.name][0].poll()) is None:
                 continue
             self._finish([stage.name])
-            if code != 0:
-                log = self._log(stage.name)
-                tail = log.read_text(errors="replace")[-_TAIL:]
-                raise PipelineError(f"stage {stage.name} ended with {code}; its log {log} ends: {tail}")
-            if missing := [str(p) for p in stage.products if not p.exists()]:
-                raise PipelineError(f"stage {stage.name} ended without {', '.join(missing)}")
-            entry = self.entries[stage.name]
-            entry.outputs = {_name(p, self.directory): digest(p) for p in stage.products}
-            entry.done = True
-            self._save()
+            try:
+                self._take(stage, code)
+            except PipelineError as error:
+                failed = failed or error
+        if failed is not None:
+            raise failed
+
+    def _take(self, stage: Stage, code: int) -> None:
+        """Take over what a stage has made whose command ended with status `code`."""
+        if code != 0:
+            log = self._log(stage.name)
+            tail = log.read_text(errors="replace")[-_TAIL:]
+            raise PipelineError(f"stage {stage.name} ended with {code}; its log {log} ends: {tail}")
+        if missing := [str(p) for p in stage.products if not p.exists()]:
+            raise PipelineError(f"stage {stage.name} ended without {', '.join(missing)}")
+        entry = self.entries[stage.name]
+        entry.outputs = {_name(p, self.directory): digest(p) for p in stage.products}
+        entry.done = True
+        self._save()
 
     def _finish(self, names: Sequence[str]) -> None:
         """Count the time of stages whose processes have just ended."""
@@ -298,9 +319,16 @@ class Pipeline:
         self._save()
 
     def _stop_all(self) -> None:
-        if self._running:
-            children.stop([process for process, _ in self._running.values()], _GRACE)
-            self._finish(self.running())
+        if not self._running:
+            return
+        # What has ended well by now is done: a stage that does not resume would be made anew.
+        ended = {stage: self._running[stage.name][0] for stage in self.stages if stage.name in self._running}
+        ended = {stage: process for stage, process in ended.items() if process.poll() == 0}
+        children.stop([process for process, _ in self._running.values()], _GRACE)
+        self._finish(self.running())
+        for stage in ended:
+            with suppress(PipelineError):  # it is another that the run ends with
+                self._take(stage, 0)
 
     def _log(self, name: str) -> Path:
         return self.directory / "logs" / f"{name}.txt"

@@ -160,13 +160,59 @@ def test_a_stage_that_failed_may_be_tried_with_another_command(tmp_path):
     assert (tmp_path / "b.txt").read_text() == "ab"
 
 
+def recording(bags, *, fails):
+    """Make a folder with one file, and fail before it holds another."""
+    code = f"import pathlib, sys; p = pathlib.Path({str(bags)!r}); p.mkdir(); (p / 'half').touch()\n"
+    code += "sys.exit('no space')" if fails else "(p / 'whole').touch()"
+    return Stage("record", ("-c", code), (bags,), resumes=False)
+
+
 def test_what_a_stage_that_cannot_resume_had_made_is_removed_before_it_starts_again(tmp_path):
     bags = tmp_path / "bags"
+    with pytest.raises(PipelineError, match="no space"):
+        Pipeline(tmp_path, [recording(bags, fails=True)]).run()
+    (bags / "of the first").touch()
+    Pipeline(tmp_path, [recording(bags, fails=False)]).run()
+    assert sorted(p.name for p in bags.iterdir()) == ["half", "whole"]
+
+
+def test_what_somebody_else_has_made_is_not_removed(tmp_path):
+    bags = tmp_path / "bags"
     bags.mkdir()
-    (bags / "half").touch()
-    record = ("-c", f"import pathlib; p = pathlib.Path({str(bags)!r}); p.mkdir(); (p / 'whole').touch()")
-    Pipeline(tmp_path, [Stage("record", record, (bags,), resumes=False)]).run()
-    assert [p.name for p in bags.iterdir()] == ["whole"]
+    (bags / "mine").touch()
+    run = Pipeline(tmp_path / "run", [*stages(tmp_path), recording(bags, fails=False)])
+    with pytest.raises(PipelineError, match=r"bags: is there already, but not of this run, whose stage record makes"):
+        run.run()
+    assert [p.name for p in bags.iterdir()] == ["mine"]
+    assert not (tmp_path / "a.txt").exists(), "refused before hours were spent"
+
+
+def test_a_stage_that_ended_well_is_done_though_another_failed_meanwhile(tmp_path):
+    """Both end while nobody looks: the recording is not to be made again."""
+    bags, failed = tmp_path / "bags", tmp_path / "failed"
+    broken = Stage("broken", ("-c", f"import pathlib; pathlib.Path({str(failed)!r}).touch(); 1 / 0"), ())
+    run = Pipeline(tmp_path, [broken, recording(bags, fails=False)])
+
+    def wait(pipeline):
+        for process, _ in pipeline._running.values():
+            process.wait(30)
+
+    with pytest.raises(PipelineError, match="stage broken ended with 1"):
+        run.run(wait)
+    assert run.entries["record"].done and run.entries["record"].outputs
+
+
+def test_a_stage_that_ended_well_is_done_though_the_run_is_stopped_meanwhile(tmp_path):
+    run = Pipeline(tmp_path, [recording(tmp_path / "bags", fails=False)])
+
+    def interrupt(pipeline):
+        for process, _ in pipeline._running.values():
+            process.wait(30)
+        raise Interrupted(signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        run.run(interrupt)
+    assert run.done
 
 
 def test_stages_without_needs_run_side_by_side_up_to_the_cores(tmp_path):
