@@ -92,7 +92,8 @@ def evaluate(run: Run, options: Options) -> None:
             time.sleep(_POLL)
             ended = [(part, process) for part, process in running if process.poll() is not None]
             running = [pair for pair in running if pair not in ended]
-            for part, process in ended:
+            # What has ended well is noted before one that failed is complained of.
+            for part, process in sorted(ended, key=lambda pair: pair[1].returncode != 0):
                 if process.returncode != 0:
                     raise ValueError(f"{run.name}: evaluate.py ended with status {process.returncode}; see "
                                      f"{part.file.with_suffix('.log')}")  # fmt: skip

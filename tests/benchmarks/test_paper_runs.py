@@ -114,6 +114,27 @@ def test_an_agent_that_loads_its_weights_by_itself_is_measured_anew_where_they_a
         assert runs.load(run)[runs.TRAINED] == digest(weights)
 
 
+def test_a_part_is_noted_beside_which_another_failed(folder, monkeypatch):
+    """Both end between two looks, the one that failed first; the other needs no second use of test levels."""
+    monkeypatch.setattr(parts, "_POLL", 0.0)
+    weights = folder / "agent.safetensors"
+    weights.write_bytes(b"trained")
+    run = runs.Run("mine", "mine", 1, further=("--agent", "mine:trained"), trained=weights)
+
+    def start(part):
+        write(run, 1, 1, {"agent": "mine:trained"})
+        part.file.parent.mkdir(parents=True, exist_ok=True)
+        run.file.replace(part.file)
+        process = subprocess.Popen(["true" if part.first else "false"])
+        process.wait()
+        return process
+
+    monkeypatch.setattr(parts.Part, "start", start)
+    with pytest.raises(ValueError, match=r"ended with status 1; see .*4000000_1\.log"):
+        parts.evaluate(run, runs.Options(episodes=2, part=1, processes=2))
+    assert parts.Part(run, 1, 1).load() is not None
+
+
 def test_the_learned_scout_is_measured_by_weights_that_do_not_ship(folder, monkeypatch, capsys):
     file = folder / "explorer.safetensors"
     (row,) = (run for run in runs.ALL if run.name == "look_around_learned")
