@@ -78,8 +78,6 @@ _TURNING_TEACHER: Final = (
 )  # fmt: skip
 """Of a body that no single action turns: it is told to stay, where it turns, often enough to learn to. PPO is what has
 taught such a body (docs/research/controller.md); it leaves no critic for the student's MPO to begin with."""
-_SENSES: Final = ("--learner.slip", "0.015", "--learner.lost", "0.05")
-"""How far the odometer is off in training of estimator and termination."""
 _VIEWS: Final = ("--noise", "0.05", "--hidden", "0.1")
 """Shares of the planner's samples that are blurred as estimates are, and that hide what the robot has not seen."""
 _MINED: Final = ("--mined", "0.25", "--led", "1", "--evaluations", "3")
@@ -233,7 +231,7 @@ def _senses(options: Options) -> list[Stage]:
         command = ["mujoban_estimator.train", "--bags", *map(str, [*earlier, *bags]), "--out", str(out)]
         command += ["--validation", str(validation.products[0])]
         every = max(1, round(_SENSES_EVALUATIONS * options.hours))
-        command += ["--evaluate-every", str(every), "--seed", str(options.stream), "--steps", str(_STEPS), *_SENSES]
+        command += ["--evaluate-every", str(every), "--seed", str(options.stream), "--steps", str(_STEPS)]
         for part in ("estimator", "termination"):
             command += [f"--learner.{part}.body", options.physics.body]
         if start is not None:

@@ -64,9 +64,9 @@ class LearnerConfig:
     """Weight of that on what frames show of heading and place, for a body that does not feel its heading."""
     cells: float = 0.1
     """Weight of the estimator's loss, a sum over cells, beside termination's."""
-    slip: float = 0.05
+    slip: float = 0.015
     """Standard deviation of errors that the odometer starts with in training, in cells: what it drifts by in use."""
-    lost: float = 0.1
+    lost: float = 0.05
     """Share of episodes in which the odometer starts anywhere, so that the camera is not ignored."""
 
     def __post_init__(self) -> None:
