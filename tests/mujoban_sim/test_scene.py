@@ -75,7 +75,7 @@ def test_robots_weigh_what_the_guide_says(body, world, kilograms):
     assert model.body(ROBOT_BODY).subtreemass[0] == pytest.approx(kilograms, abs=0.3)
 
 
-def test_boxes_weigh_25_kg_and_never_turn():
+def test_boxes_have_their_mass_and_never_turn():
     model = mujoco.MjModel.from_xml_string(scene_mjcf(np.zeros((10, 10), bool), 3, BALL, EASED))
     for k in range(3):
         body = model.body(f"box{k}")
