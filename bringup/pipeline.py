@@ -178,7 +178,7 @@ class Pipeline:
         Raises:
             PipelineError: If a command fails or does not make what it should; the others are stopped. Or if another
                 process runs the stages of this directory, what a stage needs was changed since it was made, or what it
-            would make anew is there already and not of this run.
+                would make anew is there already and not of this run.
             Interrupted: If a signal came; the commands were stopped and have kept their checkpoints.
         """
         with self.alone(), StopSignal() as stop:
@@ -319,16 +319,13 @@ class Pipeline:
         self._save()
 
     def _stop_all(self) -> None:
-        if not self._running:
-            return
-        # What has ended well by now is done: a stage that does not resume would be made anew.
-        ended = {stage: self._running[stage.name][0] for stage in self.stages if stage.name in self._running}
-        ended = {stage: process for stage, process in ended.items() if process.poll() == 0}
-        children.stop([process for process, _ in self._running.values()], _GRACE)
-        self._finish(self.running())
-        for stage in ended:
-            with suppress(PipelineError):  # it is another that the run ends with
-                self._take(stage, 0)
+        try:
+            with suppress(PipelineError):  # it is another error, or a signal, that the run ends with
+                self._reap()  # what has ended well by now is done: a stage that does not resume would be made anew
+        finally:
+            if self._running:
+                children.stop([process for process, _ in self._running.values()], _GRACE)
+                self._finish(self.running())
 
     def _log(self, name: str) -> Path:
         return self.directory / "logs" / f"{name}.txt"
