@@ -61,9 +61,8 @@ def compare(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     distinct = len(set(texts))
     effect = design_effect([solved[1][seed] - solved[0][seed] for seed in levels], texts) if distinct < n else 1.0
     mean, low, high = (100 * value for value in paired_difference(lost, won, n, NORMAL_95 * math.sqrt(effect)))
-    told = f"copies of a level are one draw, {distinct} are distinct"
-    if distinct == n:
-        told = f"sign test p = {sign_test(lost, won):.2g}"
+    copies = f"copies of a level are one draw, {distinct} are distinct"
+    told = copies if distinct < n else f"sign test p = {sign_test(lost, won):.2g}"
     rates = [f"{100 * sum(one[seed] for seed in levels) / n:.1f} %" for one in solved]
     return [
         f"{n} levels in common: the first solved {rates[0]}, the second {rates[1]}",
