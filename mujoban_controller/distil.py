@@ -251,6 +251,7 @@ class DistilLearner(ProductLearner[Batch]):
 
     def update(self, batch: Batch, progress: float, guard: NaNGuard) -> Scalars:
         """Take one gradient step."""
+        self._schedule.follow(progress)
         student, config, batch = self.student, self.config, put_on(batch, self.student.device)
         for policy in (student, self.product):
             policy.normalise(batch)
@@ -262,6 +263,5 @@ class DistilLearner(ProductLearner[Batch]):
         if norm is not None:
             self._average.update_parameters(student)
             stats["gradient_norm"] = norm
-        self._schedule.follow(progress)
         # All at once: to wait for a GPU takes longer than to copy a number.
         return dict(zip(stats, torch.stack(list(stats.values())).tolist(), strict=True))
