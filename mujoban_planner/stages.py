@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import shlex
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -230,7 +229,7 @@ def _export(directory: Path, folders: Sequence[Path]) -> None:
     records = [json.loads((folder / _PRODUCT).with_suffix(".json").read_text()) for folder in folders]
     told = [{name: record.get(name) for name in _NOTED} for record in records]
     target = directory / _PRODUCT
-    shutil.copyfile(folders[-1] / _PRODUCT, target)
+    write_atomically(target, (folders[-1] / _PRODUCT).read_bytes())
     cost = {name: sum(record.get(name) or 0 for record in records) for name in _COSTS}
     method = " then ".join(record["method"] for record in records)
     record = {**records[-1], **cost, "method": method, "stages": told}
