@@ -44,7 +44,7 @@ from mujoban_controller.product import Validation
 from mujoban_core.program import read_options, run_command
 from mujoban_core.ranges import check_counts, check_positive
 from mujoban_core.threads import set_threads
-from mujoban_msgs_py.bags.training import bags_digest, check_bag_share, check_share_of_bags
+from mujoban_msgs_py.bags.training import bags_digest, check_batch_share, check_share_has_bags
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.networks import set_scale
 from mujoban_rl.replay import steps_per_update
@@ -153,8 +153,8 @@ class Options:
         check_counts(self, "evaluation_episodes", least=0)
         if self.bags and self.config.stage == "teacher":
             raise ValueError("--bags: a teacher does not learn from them; expected --stage distil or mpo")
-        check_share_of_bags(self.bag_share)
-        check_bag_share(self.bag_share, Options.bag_share, self.bags)
+        check_batch_share(self.bag_share)
+        check_share_has_bags(self.bag_share, Options.bag_share, self.bags)
 
 
 class _Parts:

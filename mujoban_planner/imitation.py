@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
-from mujoban_msgs_py.bags.training import bags_digest, check_share_of_bags
+from mujoban_msgs_py.bags.training import bags_digest, check_batch_share
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
 from mujoban_planner.growth import beginning
 from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
@@ -103,7 +103,7 @@ class ImitationConfig(LessonConfig, LearnerConfig):
         LessonConfig.__post_init__(self)
         LearnerConfig.__post_init__(self)
         check_positive(self, "cpu_seconds")
-        check_share_of_bags(self.bag_share)
+        check_batch_share(self.bag_share)
         if self.long_moves > _LONGEST:
             raise ValueError(f"--long-moves {self.long_moves}: expected at most {_LONGEST}, as few levels take more")
         _ = self.budget

@@ -19,7 +19,7 @@ import torch
 from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive
-from mujoban_msgs_py.bags.training import bags_digest, check_share_of_bags
+from mujoban_msgs_py.bags.training import bags_digest, check_batch_share
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.discrete_mpo import MPOBatch, StepStore
 from mujoban_planner.growth import beginning
@@ -61,7 +61,7 @@ class MPOConfig(MoveConfig, NetworkConfig):
         check_positive(self, "cpu_seconds")
         check_not_negative(self, "anchor")
         check_counts(self, "critic_first", least=0)
-        check_share_of_bags(self.bag_share)
+        check_batch_share(self.bag_share)
 
 
 class MoveStore(StepStore):

@@ -22,7 +22,7 @@ import tyro
 
 from mujoban_core.program import read_options, run_command
 from mujoban_core.threads import set_threads
-from mujoban_msgs_py.bags.training import check_bag_share
+from mujoban_msgs_py.bags.training import check_share_has_bags
 from mujoban_planner.expert_iteration import ExpertIterationConfig, expert_iteration
 from mujoban_planner.exploration_mpo import ExplorerConfig, explore
 from mujoban_planner.imitation import ImitationConfig, imitation
@@ -90,7 +90,7 @@ class Imitation(_ActorCommand):
 
     def __post_init__(self) -> None:
         """Reject a share of nothing."""
-        check_bag_share(self.config.bag_share, ImitationConfig.bag_share, self.bags)
+        check_share_has_bags(self.config.bag_share, ImitationConfig.bag_share, self.bags)
 
     def main(self) -> None:
         """Train."""
@@ -119,7 +119,7 @@ class MPO(_ActorCommand):
 
     def __post_init__(self) -> None:
         """Reject a share of nothing."""
-        check_bag_share(self.config.bag_share, MPOConfig.bag_share, self.bags)
+        check_share_has_bags(self.config.bag_share, MPOConfig.bag_share, self.bags)
 
     def main(self) -> None:
         """Train."""

@@ -69,7 +69,7 @@ def open_training_bag(path: Path, wanted: Sequence[Topic], *, skip_damaged: bool
     return bag
 
 
-def check_share_of_bags(share: float) -> None:
+def check_batch_share(share: float) -> None:
     """Refuse to take nothing of a batch from bags, or more than all of it.
 
     Raises:
@@ -79,7 +79,7 @@ def check_share_of_bags(share: float) -> None:
         raise ValueError(f"--bag-share {share}: expected a share above 0, at most 1")
 
 
-def check_bag_share(share: float, default: float, bags: Sequence[Path]) -> None:
+def check_share_has_bags(share: float, default: float, bags: Sequence[Path]) -> None:
     """Refuse to take another share than the default one from no bags.
 
     Raises:
