@@ -21,7 +21,7 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from bringup.results import counted
+from bringup.results import counted, told
 from mujoban_core.program import read_options, run_command
 from mujoban_core.stats import NORMAL_95, design_effect, paired_difference, sign_test
 from mujoban_sokoban.generator import generate_level
@@ -62,13 +62,15 @@ def compare(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]:
     effect = design_effect([solved[1][seed] - solved[0][seed] for seed in levels], texts) if distinct < n else 1.0
     mean, low, high = (100 * value for value in paired_difference(lost, won, n, NORMAL_95 * math.sqrt(effect)))
     copies = f"copies of a level are one draw, {distinct} are distinct"
-    told = copies if distinct < n else f"sign test p = {sign_test(lost, won):.2g}"
+    chance = copies if distinct < n else f"sign test p = {sign_test(lost, won):.2g}"
     rates = [f"{100 * sum(one[seed] for seed in levels) / n:.1f} %" for one in solved]
     return [
         f"{n} levels in common: the first solved {rates[0]}, the second {rates[1]}",
         f"the first alone solved {counted(alone[0])}, the second alone {counted(alone[1])}",
-        f"the second less the first: {mean:+.1f} points (95 % interval {low:+.1f} to {high:+.1f}); {told}",
+        f"the second less the first: {mean:+.1f} points (95 % interval {low:+.1f} to {high:+.1f}); {chance}",
         *_otherwise(*played),
+        *_told("the first", first),
+        *_told("the second", second),
     ]
 
 
@@ -83,6 +85,11 @@ def _otherwise(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[str]
     keys = sorted((first.keys() | second.keys()) - {*_LEVELS, *_WHERE})
     apart = [f"{key} {first.get(key)} and {second.get(key)}" for key in keys if first.get(key) != second.get(key)]
     return [f"played otherwise: {', '.join(apart)}"] if apart else []
+
+
+def _told(which: str, report: Mapping[str, Any]) -> list[str]:
+    """Return a line that names who of a report's player is told the ground truth, if somebody is."""
+    return [f"{which} is {line}" for line in told(report.get("weights") or {})]
 
 
 def _read(path: Path) -> dict[str, Any]:

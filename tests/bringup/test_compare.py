@@ -15,9 +15,10 @@ class FakeLevel(str):
         return str(self)
 
 
-def report(path, solved, first=0, **played):
+def report(path, solved, first=0, weights=None, **played):
     episodes = [{"seed": first + i, "solved": bool(s)} for i, s in enumerate(solved)]
-    path.write_text(json.dumps({"episodes": episodes, "played": {"difficulty": 3, "seed": first, **played}}))
+    said = {"episodes": episodes, "played": {"difficulty": 3, "seed": first, **played}, "weights": weights}
+    path.write_text(json.dumps({name: value for name, value in said.items() if value is not None}))
     return str(path)
 
 
@@ -52,6 +53,14 @@ def test_what_was_played_otherwise_is_named(tmp_path, capsys):
     ours = report(tmp_path / "a.json", [1, 0], look_ahead=400)
     theirs = report(tmp_path / "b.json", [1, 0], first=1, look_ahead=0)
     assert said(capsys, ours, theirs)[-1] == "played otherwise: look_ahead 400 and 0"
+
+
+def test_who_is_told_the_ground_truth_is_named(tmp_path, capsys):
+    learned = report(tmp_path / "a.json", [1, 0], weights={"planner": "1" * 64})
+    cheating = report(tmp_path / "b.json", [1, 1], weights={"planner": "mine:Cheat (privileged)"})
+    *_, last = said(capsys, learned, cheating)
+    assert last == "the second is privileged, told the ground truth: planner: mine:Cheat"
+    assert "ground truth" not in "".join(said(capsys, learned, learned))
 
 
 def test_reports_of_other_levels_are_refused(tmp_path):
