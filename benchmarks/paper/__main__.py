@@ -87,8 +87,8 @@ its second round from ends in an episode's first tick, for which the stack does 
 tell](../research/estimator.md#recordings-to-judge-by) 98.2 % of its ends are within 2 ticks. The [model
 cards](../models/) have the scores of the weights that ship.
 """
-FIGURE_5 = """With ground-truth sense, as in the paper, but for the last row. The planner is the one that ships, and
-knows of no body.
+FIGURE_5 = """With ground-truth sense, as in the paper, but for the last row. Both bodies have the same planner, which
+knows of none.
 """
 TABLE_2 = """Each configuration replaces modules by oracles.
 """
@@ -141,13 +141,19 @@ def rebuild(folder: Path) -> Path:
         tables.failures(CONFIGURATIONS),
         "Beside these rows:\n",
         tables.configurations((GRAPH, *POLICY_ALONE)),
+        "Why their episodes fail:\n",
+        tables.failures((GRAPH, *POLICY_ALONE)),
         tables.differences(CONFIGURATIONS[0], GRAPH),
         "What says where to look before pushing:\n",
         tables.configurations(LOOKING_AROUND),
+        "Why their episodes fail:\n",
+        tables.failures(LOOKING_AROUND),
         f"The learned one was trained by `{EXPLORING}`; its weights do not ship, and lie in `{SCOUT_FOLDER}/`.\n",
         "## Figure 2: success against difficulty\n",
         FIGURE_2,
         tables.configurations((*DIFFICULTY, *AHEAD)),
+        "Why their episodes fail:\n",
+        tables.failures((*DIFFICULTY, *AHEAD)),
         *_figure_2(folder),
         "## Figure 3: an episode\n",
         *_film_strip(BALL.name, "Figure 3", folder / "figure3.png"),

@@ -80,24 +80,27 @@ def privileged(run: Run, report: dict[str, Any]) -> str:
 
 
 def differences(one: Run, other: Run) -> str:
-    """Return in a sentence which levels ended otherwise in one run than in another; nothing while one is missing."""
+    """Return which levels ended otherwise in one run than in another, and why; nothing while one is missing."""
     reports = [load(run) for run in (one, other)]
     if None in reports:
         return ""
-    first, second = ({e["seed"]: e["solved"] for e in report["episodes"]} for report in reports if report)
+    first, second = ({e["seed"]: e for e in report["episodes"]} for report in reports if report)
     shared = sorted(first.keys() & second.keys())
-    only = [[seed for seed in shared if a[seed] and not b[seed]] for a, b in ((first, second), (second, first))]
-    named = [", ".join(map(str, seeds)) or "none" for seeds in only]
+    named = [
+        ", ".join(f"{n} ({b[n]['failure']})" for n in shared if a[n]["solved"] and not b[n]["solved"]) or "none"
+        for a, b in ((first, second), (second, first))
+    ]
     weights = [report["weights"] for report in reports if report]
+    apart = sorted(dict(weights[0].items() ^ weights[1].items()))
     why = (
-        "Networks see batches of other sizes there, which changes the last bits of their answers, and with them now "
-        "and then a decision."
-        if weights[0] == weights[1]
-        else "They were played with other weights."
+        f"They were played with other weights: {', '.join(apart)}."
+        if apart
+        else "Networks see batches of other sizes there, which changes the last bits of their answers, and with them "
+        "now and then a decision."
     )
     return (
         f"Of {len(shared)} levels, solved by `{one.name}` alone: {named[0]}; by `{other.name}` alone: {named[1]} "
-        f"(seeds). {why}\n"
+        f"(seeds, and what the other lost them by). {why}\n"
     )
 
 

@@ -56,7 +56,7 @@ def test_the_page_has_our_numbers_beside_the_papers_and_marks_other_weights(fold
 def test_a_table_of_failures_says_what_each_of_its_causes_means(folder):
     lost = [EpisodeResult(i, False, 3.0, 100, 9, 0, 0, failure) for i, failure in enumerate(Failure)]
     write_report(report(lost, {}), runs.CONFIGURATIONS[0].file)
-    write(runs.CONFIGURATIONS[1], 3, 4, {"planner": "mine:Cheat (privileged)", "estimator": "oracle"})
+    write(runs.CONFIGURATIONS[1], 4, 4, {"planner": "mine:Cheat (privileged)", "estimator": "oracle"})
     table = tables.failures(runs.CONFIGURATIONS)
     assert "| default | none | 1 |" in table and "| planner + controller only | planner, estimator | " in table
     assert all(f"*{failure}*, {failure.meaning}" in table for failure in Failure)
@@ -69,10 +69,11 @@ def test_levels_that_end_otherwise_through_the_graph_are_named(folder):
     write(runs.CONFIGURATIONS[0], 3, 4, {})
     write(runs.GRAPH, 1, 4, {})
     told = tables.differences(runs.CONFIGURATIONS[0], runs.GRAPH)
-    assert "Of 4 levels, solved by `default` alone: 1, 2; by `graph` alone: none (seeds)." in told
+    lost = "1 (time limit), 2 (time limit)"
+    assert f"Of 4 levels, solved by `default` alone: {lost}; by `graph` alone: none (seeds, and what" in told
     assert "batches of other sizes" in told
     write(runs.GRAPH, 1, 4, {"planner": "0" * 16})
-    assert tables.differences(runs.CONFIGURATIONS[0], runs.GRAPH).endswith("They were played with other weights.\n")
+    assert tables.differences(runs.CONFIGURATIONS[0], runs.GRAPH).endswith("with other weights: planner.\n")
 
 
 def test_a_damaged_source_is_named_with_the_command_that_mends_it(folder):

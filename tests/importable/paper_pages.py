@@ -2,6 +2,7 @@
 
 from benchmarks.paper import runs
 from bringup.command import Choice, Stack
+from bringup.failure import Failure
 from bringup.results import EpisodeResult, report
 from mujoban_core.plugins import ROLES
 from mujoban_core.reports import write_report
@@ -12,5 +13,6 @@ EASY = runs.Run("easy", "easy", difficulty=1, oracle=tuple(ROLES))
 
 def write(run, solved, of, weights):
     """Write the report of a row of which the first levels were solved."""
-    episodes = [EpisodeResult(i, i < solved, 14.0 if i < solved else 3.0, 100, 9, 0, 0, None) for i in range(of)]
-    write_report(report(episodes, weights), run.file)
+    won = [EpisodeResult(i, True, 14.0, 100, 9, 0, 0, None) for i in range(solved)]
+    lost = [EpisodeResult(i, False, 3.0, 100, 9, 0, 0, Failure.TIME_LIMIT) for i in range(solved, of)]
+    write_report(report([*won, *lost], weights), run.file)
