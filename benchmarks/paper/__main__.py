@@ -78,14 +78,20 @@ module by module; cloning plays nothing while it learns.
 """
 FIGURE_2 = """At every difficulty by the planner's policy alone, and as by default, with its search ahead.
 """
-FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
-where one begins, and the axes of rates are cut. Of the controller they are its trainings as a camera policy, as a
-student and by MPO, three times each. A sample of the planner is an evaluation of its network in the search that teaches
-it; its three trainings on a core are drawn, as the one before them, [on a GPU](../research/weights.md), left no curve.
-What the termination seems to lose comes from the recordings that it was judged on, in which no late end counts, and in
-its second round from ends in an episode's first tick, for which the stack does not ask: [on recordings that can
-tell](../research/estimator.md#recordings-to-judge-by) 98.2 % of its ends are within 2 ticks. The [model
-cards](../models/) have the scores of the weights that ship.
+FIGURE_4 = """The trainings of the [weights that ship](../weights.md#the-weights-that-ship), and in orange those of
+other networks. Runs of a module are drawn end to end, so that a curve may drop where one begins, and the axes of rates
+are cut.
+
+- Controller: its trainings as a camera policy, as a student and by MPO, three times each, beside those of its teacher,
+  by reward from nothing. While a student learns, its teacher drives at first, later a fifth of the robots.
+- Planner: its three trainings on a core; the one before them, [on a GPU](../research/weights.md), left no curve. Beside
+  it the planner of [eight hours of `make weights`](../research/eight_hours/report.md), which does not ship: from
+  nothing, on two cores. A sample is an evaluation of the network in the search that teaches it.
+- Estimator and termination: two rounds of one training. The second round of bags, of the stack at work, is harder for
+  the termination. On [recordings that can tell](../research/estimator.md#recordings-to-judge-by) 98.2 % of its ends
+  are within 2 ticks.
+
+The [model cards](../models/) have the scores of the weights that ship.
 """
 FIGURE_5 = """With ground-truth sense, as in the paper, but for the last row. Both bodies have the same planner, which
 knows of none.

@@ -26,9 +26,13 @@ from mujoban_core.grid import DIFFICULTIES
 from mujoban_sim.presets import DEFAULT_WORLD
 
 _COLUMNS: Final = 4
-_METHODS: Final = {"controller": "distillation", "planner": "expert iteration"}
-"""What the weights that ship learned by; the other modules' by supervision."""
-_VARIANTS: Final = {"mpo": "MPO alone, from nothing"}
+_METHODS: Final = {"controller": "camera policy"}
+"""What the curve of the weights that ship is called beside others."""
+_VARIANTS: Final = {
+    "mpo": "MPO alone, from nothing",
+    "teacher": "its teacher",
+    "two_cores": "from nothing, two cores",
+}
 """Other ways to train a module, by the names of their files."""
 _SAMPLES: Final = {"controller": "ticks played", "planner": "samples"}
 """What a module is trained on, in whose millions a curve is drawn; the others learn from recorded ticks."""
@@ -152,14 +156,14 @@ def curves(file: Path) -> list[str]:
             prefix = f"curve_{module}_"
             others = {f.stem.removeprefix(prefix): _points(f) for f in sorted(sources.JSON.glob(f"{prefix}*.jsonl"))}
             variants = {_VARIANTS.get(name, name.replace("_", " ")): curve for name, curve in others.items()}
-            for name, curve in {_METHODS.get(module, "supervised"): points, **variants}.items():
+            for name, curve in {_METHODS.get(module, "what ships"): points, **variants}.items():
                 steps, values = [p["step"] / 1e6 for p in curve], [p["value"] for p in curve]
                 axes.plot(steps, values, marker=".", markersize=3, label=name)
             what = {p["what"] for curve in (points, *others.values()) for p in curve}
             if len(what) > 1:
                 raise ResultError(f"{files[module]}: expected curves of one measure, not of {', '.join(sorted(what))}")
             if others:
-                axes.legend(fontsize="small", loc="center right")
+                axes.legend(fontsize="small", loc="lower right")
             axes.set(title=module, xlabel=f"million {_SAMPLES.get(module, 'recorded ticks')}")
             _name_values(axes, points[0]["what"])
             axes.grid(alpha=0.3)

@@ -67,11 +67,11 @@ def test_figures_name_their_axes_their_bars_and_each_curve_in_words(folder, draw
         (runs.JSON / f"curve_{name}.jsonl").write_text("".join(json.dumps(point) + "\n" for point in points))
     figures.curves(folder / "figure4.png")
     axes, *others = drawn()
-    assert [words(other)[0] for other in others] == ["expert iteration", "supervised"]
+    assert [words(other)[0] for other in others] == ["what ships", "what ships"]
     for name in beside:
         (runs.JSON / f"curve_{name}.jsonl").unlink()
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("million ticks played", "instructions completed")
-    assert words(axes) == ["distillation", "MPO alone, from nothing", "other way"]
+    assert words(axes) == ["camera policy", "MPO alone, from nothing", "other way"]
     assert axes.yaxis.get_major_formatter()(0.5, 0) == "50 %"
     losses = [{"step": 1000 * i, "value": 2.0**-i, "what": "loss of beta"} for i in range(4)]
     (runs.JSON / "curve_termination.jsonl").write_text("".join(json.dumps(point) + "\n" for point in losses))
