@@ -17,7 +17,7 @@ from mujoban_core.grid import CHANNELS, GRID_SIZE
 from mujoban_core.plugins import AGENT
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.conversions import EpisodeTruthReading
-from mujoban_msgs_py.listening import PublisherWatch, Received, listen, refuse_run
+from mujoban_msgs_py.listening import PublisherWatch, Received, TruthWatch, listen, refuse_run
 from mujoban_msgs_py.run_identifier import ANY
 from mujoban_msgs_py.runtime.descriptors import NodeOptions
 from mujoban_msgs_py.runtime.graph_node import GraphNode
@@ -128,6 +128,7 @@ class MonitorNode(GraphNode):
             steady = topic == topics.TRUE_ABSTRACT_STATE
             listen(self, topic, partial(self._receive, topic.name), qos=qos, steady=steady)
         self._acknowledge = self.create_output(topics.MONITORED)
+        self.truth_watch = TruthWatch(self)
         self.watch = PublisherWatch(self, topics.PUBLISHERS | ({topics.TORQUE.name: AGENT} if alone else {}))
 
     @property

@@ -2,7 +2,8 @@
 
 A graph is open: whoever shares its domain can publish on its topics. A message that is not what its topic carries is
 dropped, counted and named by its topic; what passes is sound, but may still come from somebody who does not belong to
-the graph: `PublisherWatch` names them.
+the graph: `PublisherWatch` names them. And whoever shares the domain can listen: `TruthWatch` names who does so to the
+ground truth.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from mujoban_msgs_py.arrivals import Arrival, Handed, Receive, Serialised
 from mujoban_msgs_py.checks import ConversionError
@@ -21,7 +23,7 @@ from mujoban_msgs_py.decoders import DECODERS, Decode
 from mujoban_msgs_py.raw import Steady
 from mujoban_msgs_py.run_identifier import ANY, run_of
 from mujoban_msgs_py.seldom import is_due
-from mujoban_msgs_py.topics import PUBLISHERS, Topic
+from mujoban_msgs_py.topics import PUBLISHERS, TRUTH_TOPICS, Topic
 
 if TYPE_CHECKING:
     from mujoban_msgs_py.runtime.intra_process import IntraProcess
@@ -39,6 +41,10 @@ REJECTED: Final = "rejected messages"
 """Kind under which `Listener.counts` has what was dropped."""
 ANOTHER_RUN: Final = "messages of another run"
 """Kind under which it has what is sound, but not of the run that the node belongs to."""
+OVERHEARD: Final = "listeners to the ground truth"
+"""Kind under which it has nodes that `TruthWatch` names."""
+_GRAPH: Final = frozenset(f"/{name}" for name in (*PUBLISHERS.values(), "live", "video", "viz"))
+"""Nodes of the graph; reports name those of them that are told the truth."""
 
 
 class Received(NamedTuple):
@@ -186,10 +192,7 @@ class PublisherWatch:
     def _foreign(self, topic: str) -> set[str]:
         """Return the nodes that publish on a topic and have no business there."""
         own = f"/{self._publishers[topic]}"
-        names = Counter(
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-            for info in self._node.get_publishers_info_by_topic(topic)
-        )
+        names = Counter(map(_name, self._node.get_publishers_info_by_topic(topic)))
         ghosts = self.ghosts(self._publishers[topic])
         if names[own] <= 1 + ghosts:
             del names[own]
@@ -206,3 +209,45 @@ class PublisherWatch:
         changed = [t for t, n in counts.items() if every or n != self._counts.get(t) or n > 1 or self._nameless[t]]
         self._looks, self._counts = self._looks + 1, counts
         return changed
+
+
+class TruthWatch:
+    """Names those who listen to the ground truth and are none of the graph's nodes, once each.
+
+    A module that is told the truth says so, and reports name it; a node that it opened by itself they would not.
+
+    Attributes:
+        seen: All that were named.
+    """
+
+    def __init__(self, node: Node) -> None:
+        """Look on behalf of a node, every `WATCH_PERIOD` seconds."""
+        self._node = node
+        self._counts: dict[str, int] = {}
+        self.seen: set[str] = set()
+        node.create_timer(WATCH_PERIOD, self.look)
+
+    def look(self) -> None:
+        """Report who has come since the last look."""
+        new = {name for topic in TRUTH_TOPICS for name in self._come(topic.name)} - _GRAPH - self.seen
+        self.seen |= new
+        for name in sorted(new):
+            _count(self._node, OVERHEARD)
+            self._node.get_logger().warning(
+                f"node {name} listens to the ground truth and is none of the graph's: if a module has opened it, this "
+                "run's result is that of a module which is told the truth"
+            )
+
+    def _come(self, topic: str) -> set[str]:
+        """Return who listens to a topic, if there are others than at the last look, or not all were known."""
+        count = self._node.count_subscribers(topic)
+        if count == self._counts.get(topic):
+            return set()
+        names = set(map(_name, self._node.get_subscriptions_info_by_topic(topic)))
+        self._counts[topic] = count if _NAMELESS not in names else -1
+        return names - {_NAMELESS}
+
+
+def _name(end: TopicEndpointInfo) -> str:
+    """Return the name of the node that has one end of a topic."""
+    return f"{end.node_namespace.rstrip('/')}/{end.node_name}"

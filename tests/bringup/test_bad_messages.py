@@ -19,7 +19,7 @@ from bringup.viz import VizNode
 from mujoban_msgs_py import conversions, topics
 from mujoban_msgs_py.bags import open_bag
 from mujoban_msgs_py.decoders import DECODERS
-from mujoban_msgs_py.listening import ANOTHER_RUN, Received, reject
+from mujoban_msgs_py.listening import ANOTHER_RUN, OVERHEARD, Received, reject
 from mujoban_sokoban.episodes import Episodes
 from mujoban_sokoban.generator import generate_level
 
@@ -80,6 +80,18 @@ def test_a_stranger_on_a_topic_of_the_graph_is_named_also_with_a_foreign_type(pl
     graph.spin_until(lambda: graph.monitor.watch.seen == expected)
     assert graph.monitor.counts["foreign publishers"] >= 1
     assert graph.finish()[0].solved
+
+
+def test_a_stranger_who_listens_to_the_ground_truth_is_named_and_nobody_else(play_graph, stranger):
+    graph = play_graph(episodes=Episodes(1, 0, difficulty=1))
+    heard = graph.monitor.count_subscribers(topics.POSE.name)
+    stranger.create_subscription(topics.POSE.type, topics.POSE.name, print, topics.POSE.qos)
+    graph.spin_until(lambda: graph.monitor.count_subscribers(topics.POSE.name) > heard)
+    graph.monitor.truth_watch.look()
+    assert graph.monitor.truth_watch.seen == {"/tap"}, "neither oracles, which reports name, nor who hears what all may"
+    stranger.create_subscription(topics.TRUE_EPISODE.type, topics.TRUE_EPISODE.name, print, topics.TRUE_EPISODE.qos)
+    graph.spin_until(lambda: graph.monitor.truth_watch.seen == {"/tap", "/stranger"})
+    assert graph.monitor.counts[OVERHEARD] == 2
 
 
 def test_a_second_node_of_a_name_is_named_but_not_those_of_processes_that_were_killed(play_graph, stranger, capfd):

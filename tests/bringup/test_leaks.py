@@ -1,8 +1,9 @@
 """Plugins that try to cheat: one for each role, a scout and an agent, which collect what they can reach of the truth.
 
 They ask too late, or otherwise than they said, look at every field that they are given and at what lies behind it, keep
-it, write into it, and read the command line. What docs/security.md leaves to the user is not tried: the interpreter's
-memory (`gc`, frames), other processes and files, a node of one's own, and levels made from guessed seeds.
+it, write into it, and read the command line. One opens a node of its own, which hears the truth and is named. What
+docs/security.md leaves to the user is not tried: the interpreter's memory (`gc`, frames), other processes and files,
+and levels made from guessed seeds.
 """
 
 import subprocess
@@ -32,6 +33,7 @@ from mujoban_core.interfaces import module_seeds
 from mujoban_core.plugins import AGENT, ROLES, SCOUT
 from mujoban_msgs_py import topics
 from mujoban_msgs_py.conversions import EpisodeTruthReading, InstructionReading, TerminationReading
+from mujoban_msgs_py.listening import OVERHEARD
 from mujoban_msgs_py.runtime.module_node import ModuleNode
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
@@ -104,6 +106,17 @@ class Peek(Planner):
         with open("peeked.txt", "a") as file:
             print("peeked", *levels, sep="\\n", file=file)
         return super().initial_state(seeds)
+
+class Listening(Planner):
+    # Hears the truth by a node of its own.
+    def __init__(self):
+        import rclpy
+        from mujoban_msgs_py import topics
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        truth = topics.TRUE_EPISODE
+        self.node = rclpy.create_node("spy", context=self.context)
+        self.node.create_subscription(truth.type, truth.name, print, truth.qos)
 
 class Confessing(Planner):
     privileged = True
@@ -224,6 +237,15 @@ def test_in_the_graph_a_cheating_plugin_finds_nothing(cheaters, play_graph, cont
         assert vars(node.module).keys() <= {"limit", "sample", "threshold", "privileged", "asked"}
     public = set(topics.EPISODE.type.get_fields_and_field_types())
     assert public == {"header", "episode", "step", "ended"}
+
+
+def test_a_plugin_that_hears_the_truth_by_a_node_of_its_own_is_found_out(cheaters, play_graph):
+    graph = play_graph(stack(planner="Listening"), Episodes(1, 123, difficulty=1), time_limit=6)
+    try:
+        graph.spin_until(lambda: graph.monitor.truth_watch.seen == {"/tap", "/spy"})
+        assert graph.monitor.counts[OVERHEARD] == 2
+    finally:
+        graph.graph.nodes["planner"].module.context.try_shutdown()
 
 
 def test_the_process_of_a_module_is_not_told_what_the_simulators_is(ros, cheaters):
