@@ -16,6 +16,7 @@ from mujoban_planner.imitation import ImitationLearner, LearnerConfig, check_ini
 from mujoban_planner.lesson_store import LessonStore
 from mujoban_planner.samples import Batch
 from mujoban_planner.search_lessons import SearchActor, SearchConfig
+from mujoban_planner.seed_streams import LEVELS, check_seed
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Trainer
 from mujoban_rl.weights import lineage, origin, provenance
@@ -51,8 +52,9 @@ class ExpertIterationConfig(LearnerConfig):
     """Updates after which it is complete."""
 
     def __post_init__(self) -> None:
-        """Reject numbers with which nothing is learned, what is no share, and budgets of nothing."""
+        """Reject numbers with which nothing is learned, seeds that there are not, no shares, and budgets of nothing."""
         super().__post_init__()
+        check_seed(self.seed, LEVELS)
         check_counts(self, "first_evaluations")
         check_positive(self, "evaluations", "learning_rate", "horizon_seconds")
         check_shares(self, "warm_up")

@@ -358,6 +358,23 @@ def test_a_bad_option_of_a_stage_is_named_before_anything_is_written(text: str, 
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("method", ["ppo", "mpo-pushes"])
+def test_a_later_stage_that_needs_propagation_is_refused_without_it(method: str) -> None:
+    with pytest.raises(ValueError, match=f"^--stages {method}=1: propagation is False: expected True, by which"):
+        StagesConfig(stages=("imitation=1", f"{method}=1"), propagation=False)
+    assert StagesConfig(stages=("imitation=1", "mpo=1"), propagation=False).parsed
+
+
+@pytest.mark.parametrize(
+    ("method", "last"), [("mpo", 99), ("imitation", 599), ("expert-iteration", 3910), ("ppo", 3910)]
+)
+def test_a_later_stage_whose_own_seed_has_no_levels_is_refused(method: str, last: int) -> None:
+    stages = ("ppo=1", f"{method}=1")
+    with pytest.raises(ValueError, match=rf"^--stages {method}=1: seed is \d+: expected 0 to {last}, as there are no"):
+        StagesConfig(stages=stages, seed=(last + 1) // 2)
+    assert StagesConfig(stages=stages, seed=(last - 1) // 2).parsed
+
+
 def test_weights_that_there_are_none_of_have_no_share_in_the_first_stage_alone(tmp_path: Path) -> None:
     half = "imitation=1 --init-share 0.5"
     with pytest.raises(ValueError, match=r"^init_share is 0\.5: expected 0, or an --init whose share it is$"):
