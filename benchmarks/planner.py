@@ -22,7 +22,7 @@ from mujoban_planner.export import export
 from mujoban_planner.imitation import ImitationConfig, imitation_loss
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.networks import RecurrentPlanner
-from mujoban_planner.planner import LearnedPlanner
+from mujoban_planner.planner import LearnedPlanner, split_memory
 from mujoban_planner.push_env import PushEnvironment
 from mujoban_planner.samples import SampleBuffer, make_batch
 from mujoban_planner.symmetry import SYMMETRIES
@@ -58,17 +58,50 @@ def rate(step: Callable[[], object], seconds: float, device: str = "cpu") -> flo
 
 
 def decision_milliseconds(planner: LearnedPlanner, seconds: float) -> dict[str, float]:
-    """Return median and 99th percentile of the time of one decision for one robot."""
-    states = abstract_states(generate_batch(5, range(16)))
-    memory = planner.initial_state(np.zeros(1, np.int64)).memory
+    """Return median, 99th percentile and maximum of the time of one decision for one robot, ms."""
+    states, memory = abstract_states(generate_batch(5, range(16))), planner.initial_memory(1)
+
+    def decide(count: int) -> None:
+        nonlocal memory
+        _, memory = planner.decide(states[count % 16][None], memory)
+
+    return _milliseconds(decide, seconds)
+
+
+def thinking_milliseconds(thinking: int, seconds: float) -> dict[str, float]:
+    """Return the same of the planner that ships with more thinking in the network."""
+    planner = load(SHIPPED)
+    planner.thinking = thinking
+    return decision_milliseconds(planner, seconds)
+
+
+def all_sides_milliseconds(seconds: float) -> dict[str, float]:
+    """Return the same of the planner that ships where a decision looks from all sides, as before a doubtful push."""
+    planner = load(SHIPPED)
+    planner.doubt = -1.0  # whatever is said of it
+    states = abstract_states(generate_batch(5, range(128)))
+    _, memory = planner.decide(states, planner.initial_memory(len(states)))
+    _, means = split_memory(memory)
+    states = states[means.views == planner.perspectives]  # those in which a push is decided on
+    if not len(states):
+        raise RuntimeError("a planner that begins no level with a push, expected some of 128 to be begun so")
+
+    def decide(count: int) -> None:
+        planner.decide(states[count % len(states)][None], planner.initial_memory(1))
+
+    return _milliseconds(decide, seconds)
+
+
+def _milliseconds(decide: Callable[[int], None], seconds: float) -> dict[str, float]:
+    """Return median, 99th percentile and maximum of the time of calls with their number, but for the first five."""
     times: list[float] = []
     start = time.perf_counter()
-    while time.perf_counter() - start < seconds:
+    while time.perf_counter() - start < seconds or len(times) <= 5:
         before = time.perf_counter()
-        _, memory = planner.decide(states[len(times) % 16][None], memory)
+        decide(len(times))
         times.append(1e3 * (time.perf_counter() - before))
-    median, tail = np.percentile(times[5:], [50, 99])
-    return {"median_ms": float(median), "p99_ms": float(tail)}
+    median, tail, most = np.percentile(times[5:], [50, 99, 100])
+    return {"median_ms": float(median), "p99_ms": float(tail), "max_ms": float(most)}
 
 
 def exported(planner: LearnedPlanner) -> LearnedPlanner:
@@ -149,6 +182,9 @@ def measure(options: Options) -> dict[str, Any]:
             f"shipped ({type(shipped).__name__})": decision_milliseconds(shipped, options.seconds),
             "RecurrentPlanner": decision_milliseconds(exported(RecurrentPlanner()), options.seconds),
             "shipped, without its graph": decision_milliseconds(load(SHIPPED, compiled=False), options.seconds),
+            "shipped, thinking 2": thinking_milliseconds(2, options.seconds),
+            "shipped, thinking 4": thinking_milliseconds(4, options.seconds),
+            "shipped, from all eight sides": all_sides_milliseconds(options.seconds),
         },
         "training_samples_per_second": {
             "residual 64x8": training_samples_per_second(ImitationConfig(), options),

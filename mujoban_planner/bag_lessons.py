@@ -188,6 +188,10 @@ class LessonsAndBags(Source[Batch]):
         self._lessons.restore(state.part("lessons"))
         self._bags.restore(state.part("bags"))
 
+    def go_on(self, state: State) -> None:
+        """Have lessons made of other levels than so far."""
+        self._lessons.go_on(state.part("lessons"))
+
     def worker_cpu_seconds(self) -> float:
         """Return the CPU time of those who make lessons."""
         return self._lessons.worker_cpu_seconds()

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Final
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
+from mujoban_planner.growth import open_run
 from mujoban_planner.imitation import ImitationLearner, LearnerConfig, check_init_share
 from mujoban_planner.lesson_store import LessonStore
 from mujoban_planner.samples import Batch
 from mujoban_planner.search_lessons import SearchActor, SearchConfig
+from mujoban_planner.seed_streams import LEVELS, check_seed
 from mujoban_rl.actors import ActorOptions, ActorSource
 from mujoban_rl.engine import Budget, Cadence, Trainer
-from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import lineage, origin, provenance
 
 _DATA: Final = "ways and verdicts of the planner's own search on generated levels, training seeds, without a solver"
@@ -51,8 +52,9 @@ class ExpertIterationConfig(LearnerConfig):
     """Updates after which it is complete."""
 
     def __post_init__(self) -> None:
-        """Reject numbers with which nothing is learned, what is no share, and budgets of nothing."""
+        """Reject numbers with which nothing is learned, seeds that there are not, no shares, and budgets of nothing."""
         super().__post_init__()
+        check_seed(self.seed, LEVELS)
         check_counts(self, "first_evaluations")
         check_positive(self, "evaluations", "learning_rate", "horizon_seconds")
         check_shares(self, "warm_up")
@@ -79,6 +81,7 @@ def expert_iteration(
 
     Raises:
         RunError: If the directory belongs to another run.
+        WeightsError: If the weights to start from are missing or damaged, or do not fit into the network.
         ValueError: If weights are to have a share that there are none of.
     """
     check_init_share(config)
@@ -96,5 +99,5 @@ def expert_iteration(
         "init": origin(config.init),
         "data": lineage(_DATA, config.init),
     }
-    run, learner = RunDirectory(directory, config), ImitationLearner(config, config.search, device)
+    run, learner = open_run(directory, config), ImitationLearner(config, config.search, device)
     return Trainer(run, learner, source, config.budget, cadence, record=record)

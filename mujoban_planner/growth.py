@@ -1,4 +1,4 @@
-"""Start a planner network from the weights of a smaller one, so that it says the same at first.
+"""Start a planner network from the weights of a smaller one, so that it says the same at first; note which they are.
 
 Further residual blocks begin as the identity (`ResidualBlock`). Further channels compute something from the start, but
 nothing that was there listens to them yet; training makes it listen.
@@ -7,15 +7,18 @@ nothing that was there listens to them yet; training makes it listen.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from mujoban_core.files import digest
 from mujoban_planner import load
 from mujoban_planner.networks import RecurrentPlanner
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.validation import NetworkConfig
-from mujoban_rl.weights import WeightsError
+from mujoban_rl.run_directory import RunDirectory
+from mujoban_rl.weights import WeightsError, check_weights_exist
 
 _SAME = ("propagation", "judge")
 _POOLED = "inject.linear.weight"
@@ -33,6 +36,30 @@ def beginning(config: NetworkConfig, init: str | Path | None) -> LearnedPlanner:
         start_from(network, Path(init))
     network.lay_out()
     return network
+
+
+def begun_with(init: str | Path | None) -> dict[str, str] | None:
+    """Return by what a run knows the weights again that it begins with: name and digest of their file; None for none.
+
+    Raises:
+        WeightsError: If there is no such file.
+    """
+    if init is None:
+        return None
+    check_weights_exist(init)
+    return {"path": Path(init).name, "digest": digest(init)}
+
+
+def open_run(directory: Path, config: Any) -> RunDirectory:
+    """Open or reopen the directory of a run whose configuration has an option `init`.
+
+    Its weights are read again when the run is resumed, so that they must not change meanwhile.
+
+    Raises:
+        RunError: If it belongs to another run, or the file of the weights was another when this one began.
+        WeightsError: If there is no such file.
+    """
+    return RunDirectory(directory, config, beside={"begun_with": begun_with(config.init)})
 
 
 def start_from(network: LearnedPlanner, path: Path) -> None:

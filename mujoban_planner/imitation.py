@@ -18,7 +18,7 @@ from torch.nn import functional
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_msgs_py.bags.training import bags_digest, check_batch_share
 from mujoban_planner.bag_lessons import BagLessons, Lessons, LessonsAndBags
-from mujoban_planner.growth import beginning
+from mujoban_planner.growth import beginning, open_run
 from mujoban_planner.lesson_source import LessonActor, LessonConfig, LessonSource
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.product import PlannerLearner
@@ -31,7 +31,6 @@ from mujoban_rl.engine import Budget, Cadence, Source, State, Trainer
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_rl.precision import autocast
-from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import lineage, origin, provenance, usable_device
 
 _CLIP = 1.0
@@ -268,10 +267,11 @@ def imitation(
     Raises:
         RunError: If the directory belongs to another run.
         BagError: If a bag is not what is expected.
+        WeightsError: If the weights to start from are missing or damaged, or do not fit into the network.
         ValueError: If weights are to have a share that there are none of.
     """
     check_init_share(config)
-    run = RunDirectory(directory, config)
+    run = open_run(directory, config)
     learner = ImitationLearner(config, config, device)
     source = _source(config, actors or ActorOptions(), bags, device)
     record = {

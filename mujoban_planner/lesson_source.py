@@ -18,7 +18,7 @@ from torch import Tensor
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.samples import Batch, SampleBuffer, Samples, concatenate, make_batch
-from mujoban_planner.seed_streams import stream_number
+from mujoban_planner.seed_streams import LESSONS, check_seed, stream_number
 from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.uncertainty import Uncertainty, UncertaintyConfig
 from mujoban_planner.validation import NetworkConfig, Shares, check_mix, difficulty_shares
@@ -63,7 +63,7 @@ class LessonConfig(UncertaintyConfig):
         """Reject lessons of nothing, and what is no share."""
         super().__post_init__()
         check_counts(self, "batch_size", "long_moves", "levels", "stock", "enough", "buffer")
-        check_counts(self, "seed", least=0)
+        check_seed(self.seed, LESSONS)
         check_shares(self, "corrections", "judged", "long")
         check_positive(self, "freshness")
         check_mix(self.mix)

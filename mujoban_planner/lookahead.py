@@ -56,9 +56,9 @@ class LookAheadPlanner(Planner):
     """Searches when it has no plan for the state that it finds, follows the plan while the world does.
 
     A plan is thrown away when the boxes or the robot are not where it expects them, when the targets change, when what
-    the rest of it needs is no longer certain (boxes, targets, and neither wall nor box on the way), or when a planned
-    move keeps failing. Where the search finds nothing, or what it found is not certain, the learned planner decides
-    alone.
+    the rest of it needs is no longer certain (boxes, targets, neither wall nor box on the way, and that no box with its
+    target is still to be found), or when a planned move keeps failing. Where the search finds nothing, or what it found
+    is not certain, the learned planner decides alone.
     """
 
     def __init__(
@@ -188,18 +188,21 @@ class LookAheadPlanner(Planner):
     def _is_certain(
         self, state: NDArray[np.float32], boards: BitBoards, row: int, instructions: NDArray[np.int64]
     ) -> bool:
-        """Return whether all is certain that instructions rest on in a state, [N, N, 4]: boxes, targets, a free way."""
+        """Return whether all is certain that instructions rest on in a state, [N, N, 4].
+
+        These are boxes and targets, that there are no others, and a free way.
+        """
         needed = _squares_used(boards.box[row], int(boards.agent[row]), instructions)
         inner = state[1:-1, 1:-1].reshape(-1, state.shape[-1])
-        used, target, box = (
+        used, target, box, wall = (
             np.unpackbits(np.array([squares], "<u8").view(np.uint8), bitorder="little").astype(np.bool_)
-            for squares in (needed, boards.target[row], boards.box[row])
+            for squares in (needed, boards.target[row], boards.box[row], boards.wall[row])
         )
         used[int(boards.agent[row])] = False  # nothing stands where the robot does
         doubt = min(1.0 - self.certainty, _LIKELIER)
         free = (inner[used, WALL] <= doubt).all() and (inner[used & ~box, BOX] <= doubt).all()
         there = (inner[box, BOX] >= self.certainty).all() and (inner[target, TARGET] >= self.certainty).all()
-        return bool(free and there)
+        return bool(free and there) and _all_found(inner[~wall]) >= self.certainty
 
     def _choose(
         self, states: NDArray[np.float32], rows: NDArray[np.int64], counts: VisitCounts, means: PushMeans
@@ -219,6 +222,17 @@ def _noted(searches: SearchMemory) -> SearchMemory:
 def _searching(searches: NDArray[Any]) -> NDArray[np.bool_]:
     """Return which searches, None for none, may still find a solution."""
     return np.array([search is not None and search.open for search in searches], np.bool_)
+
+
+def _all_found(floor: NDArray[np.float32]) -> float:
+    """Return the probability that a state has no further box in cells that are likely floor, [F, 4].
+
+    A plan is for as many boxes as targets, and so is a level: a box is left to be found only together with a target, so
+    that it is enough to be certain of the one or the other. Cells are taken as independent; in one that was never in
+    view an estimator holds a box for much less than likely even where there is one.
+    """
+    unlikely = (np.where(floor[:, layer] > _LIKELIER, 0.0, floor[:, layer]) for layer in (BOX, TARGET))
+    return max(float(np.prod(1.0 - probability)) for probability in unlikely)
 
 
 @njit(cache=True, nogil=True)

@@ -22,7 +22,7 @@ from mujoban_planner.abstract_env import AbstractEnvironment
 from mujoban_planner.boards import abstract_states
 from mujoban_planner.discrete_mpo import MPOSettings
 from mujoban_planner.planner import LearnedPlanner
-from mujoban_planner.seed_streams import MOVES, first_seed, stream_number
+from mujoban_planner.seed_streams import MOVES, check_seed, first_seed, stream_number
 from mujoban_planner.validation import Shares, check_mix, difficulty_shares
 from mujoban_rl.actors import Actor, Experience
 from mujoban_rl.engine import State
@@ -41,8 +41,9 @@ class PlayConfig(MPOSettings):
     """Share of each difficulty among the training levels."""
 
     def __post_init__(self) -> None:
-        """Reject what is no share."""
+        """Reject what is no share, and seeds that there are not."""
         super().__post_init__()
+        check_seed(self.seed, MOVES)
         check_mix(self.mix)
 
 

@@ -21,6 +21,7 @@ from torch.nn import functional
 
 from mujoban_core.ranges import check_counts, check_positive, check_shares
 from mujoban_planner.boards import BitBoards, signed
+from mujoban_planner.growth import open_run
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.product import PlannerLearner
 from mujoban_planner.push_actor import BOARDS, STEP, PlayConfig, PushActor
@@ -36,7 +37,6 @@ from mujoban_rl.losses.returns import windowed_returns
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, moving_average, warm_up_cosine
 from mujoban_rl.precision import autocast
 from mujoban_rl.replay import SequenceBuilder, SequenceReplay
-from mujoban_rl.run_directory import RunDirectory
 
 _KEPT: Final = (*BOARDS, *STEP)
 """What is kept of a step."""
@@ -250,7 +250,7 @@ def push_mpo(
         first_steps=config.first_steps,
     )
     return Trainer(
-        RunDirectory(directory, config),
+        open_run(directory, config),
         PushMPOLearner(config),
         source,
         config.budget,

@@ -18,6 +18,7 @@ from torch.distributions import Categorical
 
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive, check_shares
 from mujoban_planner.boards import BitBoards
+from mujoban_planner.growth import open_run
 from mujoban_planner.planner import LearnedPlanner
 from mujoban_planner.product import PlannerLearner
 from mujoban_planner.push_actor import BOARDS, STEP, PlayConfig, PushActor
@@ -28,7 +29,6 @@ from mujoban_rl.limits import NaNGuard
 from mujoban_rl.losses.ppo import PPOConfig, generalised_advantages, ppo_loss
 from mujoban_rl.optimise import ProgressSchedule, guarded_step, warm_up_cosine
 from mujoban_rl.precision import autocast
-from mujoban_rl.run_directory import RunDirectory
 
 PPO_PACE: Final = {"publish_updates": 1}
 """How often a run publishes: each rollout is to be played by the newest policy."""
@@ -157,7 +157,7 @@ def push_ppo(
     pool = options.pool(partial(PushActor, config.network, config.play, config.seed))
     source = ActorSource(pool, Rollouts(axis=-1, count=options.num_actors))
     return Trainer(
-        RunDirectory(directory, config),
+        open_run(directory, config),
         PushPPOLearner(config),
         source,
         config.budget,

@@ -7,9 +7,10 @@ from typing import Any
 
 import torch
 
-from mujoban_core.ranges import check_counts, check_not_negative, check_shares
+from mujoban_core.ranges import check_not_negative, check_shares
 from mujoban_planner.growth import beginning
 from mujoban_planner.push_policy import Anchor, PushPolicy
+from mujoban_planner.seed_streams import LEVELS, check_seed
 from mujoban_planner.validation import NetworkConfig
 from mujoban_rl.engine import Budget
 from mujoban_rl.weights import lineage, origin, provenance
@@ -39,9 +40,11 @@ class PushRunConfig(NetworkConfig):
     """Share of a batch's states in which they are asked."""
 
     def __post_init__(self) -> None:
-        """Reject networks of nothing, seeds that there are not, and budgets of nothing."""
+        """Reject networks that pushes cannot be taught, seeds that there are not, and budgets of nothing."""
         super().__post_init__()
-        check_counts(self, "seed", least=0)
+        if not self.propagation:
+            raise ValueError("propagation is False: expected True, by which decisions follow the push head")
+        check_seed(self.seed, LEVELS)
         check_not_negative(self, "anchor")
         check_shares(self, "anchored")
         _ = self.budget

@@ -16,13 +16,12 @@ from typing import Final
 
 import torch
 
-from mujoban_core.files import digest
 from mujoban_core.grid import Instruction
 from mujoban_core.ranges import check_counts, check_not_negative, check_positive
 from mujoban_msgs_py.bags.training import bags_digest, check_batch_share
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.discrete_mpo import MPOBatch, StepStore
-from mujoban_planner.growth import beginning
+from mujoban_planner.growth import beginning, begun_with
 from mujoban_planner.heads import silence_verdicts
 from mujoban_planner.move_learner import MoveLearner
 from mujoban_planner.moves import MoveActor, MoveConfig
@@ -162,7 +161,7 @@ def reinforcement(
     Raises:
         ValueError: If the directory belongs to another run, or device, weights or a bag are not what is expected.
     """
-    origin = None if init is None else {"path": init.name, "digest": digest(init)}
+    origin = begun_with(init)
     run = RunDirectory(directory, config, beside={"init": origin})
     recorded = BagTransitions.read(bags) if bags else None
     learner = MPOLearner(config, device=device, init=init)

@@ -16,8 +16,21 @@ MOVES: Final = range(600_000, 700_000)
 """Streams of play over moves."""
 LEVELS: Final = range(700_000, len(TRAIN_SEEDS) // _SEEDS)
 """Streams of what search and play over pushes draw."""
-LAST_SEED: Final = len(LEVELS) // _STREAMS_PER_SEED - 1
-"""The largest seed of a run by search, or over pushes, whose every stream has levels."""
+
+
+def last_seed(streams: range) -> int:
+    """Return the largest seed of a run whose every stream, among `LESSONS`, `MOVES` or `LEVELS`, has levels."""
+    return len(streams) // _STREAMS_PER_SEED - 1
+
+
+LAST_SEED: Final = last_seed(LEVELS)
+"""That of a run by search, or over pushes."""
+
+
+def check_seed(seed: int, streams: range) -> None:
+    """Raise ValueError unless a run with this seed has training levels of its own."""
+    if not 0 <= seed <= last_seed(streams):
+        raise ValueError(f"seed is {seed}: expected 0 to {last_seed(streams)}, as there are no levels for others")
 
 
 def stream_number(seed: int, stream: int) -> int:
@@ -38,6 +51,6 @@ def first_seed(streams: range, number: int) -> int:
         ValueError: If there is no such stream.
     """
     if not 0 <= number < len(streams):
-        last = len(streams) // _STREAMS_PER_SEED - 1
+        last = last_seed(streams)
         raise ValueError(f"stream {number}: expected 0 to {len(streams) - 1}, those of the seeds 0 to {last} of runs")
     return TRAIN_SEEDS.start + streams[number] * _SEEDS

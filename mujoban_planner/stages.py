@@ -108,7 +108,7 @@ class StagesConfig(NetworkConfig):
     """Seed of networks and of all that is drawn."""
 
     def __post_init__(self) -> None:
-        """Reject networks of nothing, budgets of nothing, and what is no method, no share or no option of a stage."""
+        """Reject networks and budgets of nothing, no method, share or option, and what a later stage cannot have."""
         super().__post_init__()
         check_counts(self, "seed", least=0)
         check_positive(self, "cpu_seconds")
@@ -121,17 +121,21 @@ class StagesConfig(NetworkConfig):
         """Methods with their configurations, but for the weights that they begin with; shares are those of the time.
 
         Raises:
-            ValueError: If a method is unknown, a share is not positive, or an option is no stage's or out of its range.
+            ValueError: If a method is unknown, a share is not positive, an option is no stage's or out of its range, or
+                a stage cannot have the network of the whole run or has a seed without levels.
         """
         read = [_read_stage(text) for text in self.stages]
         if not read:
             raise ValueError("--stages: expected at least one METHOD=SHARE")
         total = sum(weight for _, weight, _ in read)
         stages = []
-        for i, (method, weight, own) in enumerate(read):
+        for i, (text, (method, weight, own)) in enumerate(zip(self.stages, read, strict=True)):
             seed = len(read) * self.seed + i  # each stage has levels of its own
             whole = asdict(self.network) | {"seed": seed, "cpu_seconds": weight / total * self.cpu_seconds}
-            stages.append((method, replace(own, **whole)))
+            try:
+                stages.append((method, replace(own, **whole)))
+            except ValueError as error:
+                raise ValueError(f"--stages {text}: {error}") from None
         return stages
 
 

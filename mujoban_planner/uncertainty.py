@@ -98,9 +98,13 @@ class UncertaintyConfig:
         return bool(self.noise or self.hidden)
 
     def __post_init__(self) -> None:
-        """Reject what is no share, and no factor."""
+        """Reject what is no share and no factor, more than a batch, and errors in states that there are none of."""
         check_shares(self, "noise", "hidden")
         check_not_negative(self, "errors")
+        if self.noise + self.hidden > 1.0:  # what is hidden starts from the truth, and not from what is blurred
+            raise ValueError(f"noise is {self.noise} and hidden {self.hidden}: expected at most 1 together")
+        if self.errors and not self.hidden:
+            raise ValueError(f"errors is {self.errors}: expected 0, or a --hidden above 0, whose states have them")
 
 
 class Uncertainty:

@@ -136,6 +136,7 @@ class Source(_Part, Generic[BatchT]):
 
 CARRIED: Final = (
     "progress", "metrics", "skipped", "due", "learner.best", "source.pool.next_stream", "source.pool.pool.next_stream",
+    "source.lessons.pool.next_stream", "source.lessons.pool.pool.next_stream",
 )  # fmt: skip
 """What a light copy of a checkpoint holds beside its modules (see `mujoban_rl.run_directory.copy_light`)."""
 _GOES_ON: Final = "; the same command goes on from there"

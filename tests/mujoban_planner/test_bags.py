@@ -17,7 +17,10 @@ from mujoban_planner import train
 from mujoban_planner.bag_lessons import BagLessons, Lessons
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.imitation import ImitationConfig, imitation
+from mujoban_planner.lesson_source import LessonActor
 from mujoban_planner.reinforcement import MoveStore, MPOConfig, reinforcement
+from mujoban_rl.engine import CARRIED
+from mujoban_rl.run_directory import copy_light
 from mujoban_rl.testing import check_resuming
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
 from mujoban_sokoban.solver import solve_level
@@ -90,6 +93,22 @@ def test_lessons_and_bags_share_a_batch_and_resume_to_the_bit(bags, tmp_path, mo
 
     check_resuming(make, tmp_path, stop_at=2, updates=4)
     assert trainers[0].progress.samples == 4 * 16
+
+
+def test_a_run_with_bags_that_goes_on_from_a_light_copy_has_lessons_of_other_levels(bags, tmp_path, monkeypatch):
+    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
+    streams = []
+
+    class Noted(LessonActor):
+        def __init__(self, config, network, stream, *, device):
+            streams.append(stream)
+            super().__init__(config, network, stream, device=device)
+
+    monkeypatch.setattr("mujoban_planner.imitation.LessonActor", Noted)
+    imitating(tmp_path / "run", bags, 0.25).run(limit_updates=1)
+    copy_light(tmp_path / "run", tmp_path / "light", CARRIED)
+    imitating(tmp_path / "light", bags, 0.25).run(limit_updates=2)
+    assert streams == [0, 1]
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.05, 1), (0.25, 2), (0.9, 7)])

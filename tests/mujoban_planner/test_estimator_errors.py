@@ -100,6 +100,14 @@ def test_an_option_makes_the_states_of_a_batch_wrong(states):
         UncertaintyConfig(errors=-1.0)
 
 
+def test_what_is_asked_of_states_that_a_batch_does_not_have_is_refused():
+    with pytest.raises(ValueError, match=r"^errors is 1\.0: expected 0, or a --hidden above 0, whose"):
+        UncertaintyConfig(noise=0.1, errors=1.0)
+    with pytest.raises(ValueError, match=r"^noise is 0\.7 and hidden 0\.4: expected at most 1 together$"):
+        UncertaintyConfig(noise=0.7, hidden=0.4)
+    assert UncertaintyConfig(noise=0.6, hidden=0.4, errors=1.0).shows_estimates
+
+
 def test_rates_that_are_none_are_refused_in_words(tmp_path):
     path = tmp_path / "rates.json"
     for text in ("{", "{}", json.dumps(ErrorRates.read()._replace(shape=-1.0).report)):

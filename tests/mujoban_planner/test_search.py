@@ -203,6 +203,44 @@ def test_a_plan_is_followed_only_while_all_that_it_needs_is_certain(planner, cel
         assert (after[0] == memory[0]).all() == kept
 
 
+HALL = Level.from_text("########\n#@$  .##\n#      #\n#      #\n########")
+
+
+def hall(box, target, level=HALL):
+    """Return a state in which there is so probably a box, and so probably a target, in each cell below the corridor."""
+    states = corridor(level=level)
+    states[0, 4:6, 2:8, 3], states[0, 4:6, 2:8, 1] = box, target
+    assert not states[0, 4:6, 2:8, 0].any() and states[0, 3, :, 1].any()
+    return states
+
+
+@pytest.mark.parametrize(
+    ("box", "target", "certainty", "followed"),
+    [(0.04, 0.04, 0.9, False), (0.04, 0.04, 0.0, True), (0.001, 0.04, 0.9, True), (0.04, 0.001, 0.9, True)],
+    ids=["a box and its target may be hidden", "nothing is to be certain", "no box is hidden", "no target is hidden"],
+)
+def test_a_plan_is_followed_only_while_no_box_with_its_target_is_to_be_found(
+    planner, box, target, certainty, followed
+):
+    player = LookAheadPlanner(planner, 400, certainty=certainty)
+    _, memory = player.decide(hall(box, target), player.initial_state(np.zeros(1, np.int64)).memory)
+    assert memory[0].any() == followed
+    plan, _, memory = first_plan(planner, hall(0.0, 0.0))
+    pushed = Level.from_text(HALL.to_text().replace("@$ ", " @$"))
+    _, after = player.decide(hall(box, target, pushed), memory)
+    assert np.count_nonzero(plan) == 3 and (after[0] == plan).all() == followed
+
+
+def test_a_plan_for_a_level_that_was_seen_whole_is_followed(planner):
+    """An estimate of such a level, of the running stack: 0.1 % for boxes that there are not, a doubtful target."""
+    states = hall(0.0001, 0.0005)
+    states[0, 4, 6, 1] = 0.4
+    rock = states[0, ..., 0] > 0.5
+    states[0, rock, 0], states[0, rock, 1:] = 0.97, [0.01, 0.0, 0.01]
+    states[0, [0, -1]], states[0, :, [0, -1]] = [1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+    assert first_plan(planner, states)[0].any()
+
+
 def test_what_a_plan_has_left_behind_need_not_be_certain(planner):
     _, _, memory = first_plan(planner, corridor())
     states = corridor((4, 2), 3, 0.4, Level.from_text("########\n# @$ .##\n########"))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +199,34 @@ def test_every_method_goes_on_with_a_planner_that_thinks(
     assert json.loads(product.with_suffix(".json").read_text())["data"].startswith("a test; then ")
 
 
+@pytest.mark.parametrize("method", sorted(stages.METHODS))
+def test_a_run_does_not_go_on_with_other_weights_in_the_place_of_those_that_it_began_with(
+    method: str, tmp_path: Path
+) -> None:
+    def make() -> Trainer[Any]:
+        config = replace(stages.METHODS[method].config, **asdict(network), cpu_seconds=1e9)
+        place = stages._Place(tmp_path / "run", OFTEN, ActorOptions(), "cpu", str(start))
+        return stages.METHODS[method].trainer(config, place)
+
+    start = small_planner(tmp_path / "start.safetensors")
+    network = NetworkConfig.of(start)
+    make().save()
+    make()
+    then = digest(start)
+    torch.manual_seed(99)  # of no run
+    now = digest(small_planner(start))
+    with pytest.raises(RunError) as error:
+        make()
+    assert re.search(f"'start.safetensors', 'digest': '{then}'.* there, .*'{now}'.* now", str(error.value))
+    assert len(str(error.value).splitlines()) == 1
+    # Runs that began before this was noted are taken at their word.
+    file = tmp_path / "run" / "config.json"
+    noted = json.loads(file.read_text())
+    del noted["init" if method == "mpo" else "begun_with"]
+    file.write_text(json.dumps(noted))
+    make()
+
+
 def test_weights_that_do_not_fit_are_named_before_anything_is_written(tmp_path: Path) -> None:
     start = small_planner(tmp_path / "start.safetensors", blocks=4)
     config = StagesConfig("thinking", channels=8, blocks=3, tied=1, init=str(start))
@@ -268,7 +297,8 @@ def test_options_in_the_text_of_a_stage_are_those_of_its_method_alone(tmp_path: 
     plain, ppo = (stored(tmp_path / run, "1_ppo") for run in ("plain", "own"))
     assert ppo == plain | {"epochs": 2, "play": plain["play"] | {"steps": 2}} != plain
     plain, mpo = (stored(tmp_path / run, "2_mpo-pushes") for run in ("plain", "own"))
-    init = {"init": str(tmp_path / "own" / "1_ppo" / "planner.safetensors")}
+    begun = tmp_path / "own" / "1_ppo" / "planner.safetensors"
+    init = {"init": str(begun), "begun_with": {"path": begun.name, "digest": digest(begun)}}
     assert mpo == plain | init | {"learning_rate": 2e-4, "time_outs_lost": False}
 
 
@@ -326,6 +356,23 @@ def test_a_bad_option_of_a_stage_is_named_before_anything_is_written(text: str, 
         train.main(["stages", "--run", str(tmp_path / "run"), "--stages", "imitation=1", text])
     assert str(error.value) == f"--stages {text}: {said}"
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("method", ["ppo", "mpo-pushes"])
+def test_a_later_stage_that_needs_propagation_is_refused_without_it(method: str) -> None:
+    with pytest.raises(ValueError, match=f"^--stages {method}=1: propagation is False: expected True, by which"):
+        StagesConfig(stages=("imitation=1", f"{method}=1"), propagation=False)
+    assert StagesConfig(stages=("imitation=1", "mpo=1"), propagation=False).parsed
+
+
+@pytest.mark.parametrize(
+    ("method", "last"), [("mpo", 99), ("imitation", 599), ("expert-iteration", 3910), ("ppo", 3910)]
+)
+def test_a_later_stage_whose_own_seed_has_no_levels_is_refused(method: str, last: int) -> None:
+    stages = ("ppo=1", f"{method}=1")
+    with pytest.raises(ValueError, match=rf"^--stages {method}=1: seed is \d+: expected 0 to {last}, as there are no"):
+        StagesConfig(stages=stages, seed=(last + 1) // 2)
+    assert StagesConfig(stages=stages, seed=(last - 1) // 2).parsed
 
 
 def test_weights_that_there_are_none_of_have_no_share_in_the_first_stage_alone(tmp_path: Path) -> None:
