@@ -40,7 +40,7 @@ from mujoban_core.program import read_options, run_command
 from mujoban_core.ranges import check_counts, check_positive
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.bags.training import bags_digest
-from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
+from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts, learner_generators
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.exploration import Exploration
 from mujoban_rl.run_directory import RunDirectory
@@ -187,8 +187,7 @@ def mpo_parts(
                 raise ValueError(f"--{name} {asked}: {config.start} holds weights of {name} {held}, expected that")
     build = partial(kind, **agent.config)
     critic: Critic = AsymmetricCritic(body) if config.critic == "asymmetric" else SymmetricCritic(body, agent.width)
-    streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(2)]
-    generators = [torch.Generator().manual_seed(seed) for seed in streams]
+    generators = learner_generators(config.seed, 2)
     plays = task or partial(MujobanTask, config.task)
     factory = partial(make_actor, plays, build, mpo.window, mpo.overlap, critic.sees, mpo.exploration, config.seed)
     store = WindowStore(mpo, generators[0])
