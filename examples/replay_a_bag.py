@@ -43,7 +43,8 @@ def replay(bag: Bag) -> None:
     for ticks in episodes(bag, TOPICS, allow_test_seeds=True):  # nothing is learned from them
         spec = EpisodeSpec(Level.from_text(ticks[0][0].level), ticks[0][0].seed)
         boxes = int(bag.about.get("max_boxes", len(spec.level.boxes)))
-        world = World(1, body=body, world=name, max_boxes=boxes)
+        # An episode may have been recorded with more time than the body's, after which a world stands still.
+        world = World(1, body=body, world=name, max_boxes=boxes, time_limit=len(ticks))
         world.reset([0], [spec])
         apart = 0.0
         for _, pose, torque in ticks:

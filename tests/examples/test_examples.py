@@ -5,6 +5,7 @@ import shutil
 import sys
 import tempfile
 from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from bringup.rollout_recorder import Recorder
 from mujoban_baselines.random_agent import RandomAgent
 from mujoban_baselines.repeat import Repeating
 from mujoban_core.agent import OWN_SENSES, AgentInput, AgentPolicy
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES
 from mujoban_sim.presets import WORLDS
@@ -176,6 +177,17 @@ def test_a_bag_is_replayed_with_room_for_as_many_boxes_as_it_was_recorded_with(r
             recorder.write(tick)
     (bag,) = (tmp_path / "bag").iterdir()
     assert f"seed {spec.seed}: 200 ticks, at most 0.0e+00 apart" in run("replay_a_bag.py", bag)
+
+
+def test_a_bag_of_longer_episodes_than_the_bodys_is_replayed_to_their_end(run, tmp_path, monkeypatch):
+    spec = EpisodeSpec(generate_level(1, TRAIN_SEEDS.start), TRAIN_SEEDS.start)
+    agent = Repeating(RandomAgent(), 10, BALL.action_size)
+    with Recorder(tmp_path / "bag", BALL, [spec], [1]) as recorder:
+        for tick in ticks(AgentPolicy(agent), World(1, max_boxes=1, time_limit=40), [spec], camera=True):
+            recorder.write(tick)
+    (bag,) = (tmp_path / "bag").iterdir()
+    monkeypatch.setitem(BODIES, BALL.name, replace(BALL, time_limit=20))
+    assert run("replay_a_bag.py", bag) == f"seed {spec.seed}: 40 ticks, at most 0.0e+00 apart\n"
 
 
 def test_a_bag_of_levels_that_are_not_for_training_is_replayed_too(run, oracles, tmp_path):
