@@ -1,5 +1,6 @@
 """Every example runs as it is printed."""
 
+import re
 import runpy
 import shutil
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bringup.evaluate import main as evaluate_main
 from bringup.rollout import ticks
 from bringup.rollout_recorder import Recorder
 from mujoban_baselines.random_agent import RandomAgent
@@ -26,6 +28,7 @@ from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import PLAY_SEEDS, TRAIN_SEEDS, generate_level
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+POLICY_EXAMPLE = EXAMPLES / "evaluate_beside_the_stack.py"
 
 
 @pytest.fixture
@@ -53,7 +56,7 @@ def trained(run, tmp_path, monkeypatch):
 @pytest.fixture
 def agents():
     """Return what the evaluating example defines."""
-    return runpy.run_path(str(EXAMPLES / "evaluate_beside_the_stack.py"))
+    return runpy.run_path(str(POLICY_EXAMPLE))
 
 
 def make():
@@ -108,6 +111,14 @@ def test_a_policy_that_was_trained_on_the_task_itself_sees_what_the_robot_sees(r
     assert set(policy.sees) == set(OWN_SENSES) and policy.cameras == ("first_person",) and not policy.privileged
     said = run("evaluate_beside_the_stack.py", "--episodes", 1, "--time-limit", 5, "--oracle", ",".join(ROLES))
     assert "agent: " not in said.split("\nstack\n")[0]
+
+
+def test_other_programs_play_the_policy_by_the_command_that_is_printed(trained, monkeypatch, capsys):
+    (command,) = re.findall(r"PYTHONPATH=examples python bringup/evaluate\.py (.*)", POLICY_EXAMPLE.read_text())
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    assert evaluate_main([*command.split(), "--episodes", "1", "--time-limit", "5"]) == 0
+    assert "solved 0 of 1" in capsys.readouterr().out
+    sys.modules.pop(POLICY_EXAMPLE.stem)
 
 
 def test_a_policy_of_another_body_is_one_line(run, trained):
