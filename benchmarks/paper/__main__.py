@@ -76,7 +76,8 @@ is left out: all begin at once, and the first to end are those that were solved 
 difficulty has a curve of that one, and a point is of 20 episodes at least. The modular row's learning is in Figure 4,
 module by module; cloning plays nothing while it learns.
 """
-FIGURE_2 = """At every difficulty by the planner's policy alone, and as by default, with its search ahead.
+FIGURE_2 = """At every difficulty by the planner's policy alone, and as by default, with its search ahead. The rows of
+[Table 1](#table-1-main-results) are drawn as well, each with a marker of its own and a little aside.
 """
 FIGURE_4 = """The trainings of the weights that ship. Runs of a module are drawn end to end, so that a curve may drop
 where one begins, and the axes of rates are cut. Of the controller they are its trainings as a camera policy, as a
