@@ -39,6 +39,7 @@ INTRODUCTION = f"""# Results
 
     python -m benchmarks.paper.runs                    # everything: hours on two cores; goes on where it was ended
     python -m benchmarks.paper.runs --only NAME        # one row, by the name in its table, film_strip or film_strip_ant
+    python -m benchmarks.paper.runs --only NAME_1      # an agent of Table 1 by that name, at difficulty 1
     python -m benchmarks.paper.curves --help           # learning curves from the run directories of trainers
 
 Rows are of the *{DEFAULT_WORLD}* world, the environment that the paper's authors released, as measured in its recorded

@@ -122,16 +122,16 @@ def test_uses(runs: Iterable[Run], films: Iterable[dict[str, Any] | None]) -> st
 
 def baselines() -> str:
     """Return Table 1: the modular stack and what it is compared with, what each was trained on and how long."""
-    header = ["agent", "sees", "trained on", "steps", "CPU hours", "wall-clock", "paper", "n"]
+    header = ["agent", "name", "sees", "trained on", "steps", "CPU hours", "wall-clock", "paper", "n"]
     header += [f"difficulty {d}" for d in DIFFICULTIES]
     rates = _rates(DIFFICULTY)
     title = "modular, as it ships, the planner's policy alone"
-    rows = [[title, "o_cam, o_pr, o_pos", MODULAR_LEVELS, *_cost([]), MODULAR.paper, *rates]]
+    rows = [[title, MISSING, "o_cam, o_pr, o_pos", MODULAR_LEVELS, *_cost([]), MODULAR.paper, *rates]]
     for row in (*BASELINES, *(again for again in AGAIN if points_of(again))):
         paper = "; ".join(filter(None, (row.paper, _SAID.get(row.name))))
         rates = _rates([row.run(d) for d in DIFFICULTIES])
         levels = f"{row.levels} ([how]({row.guide}))" if row.guide else row.levels
-        rows.append([row.title, row.sees, levels, *_cost(points_of(row)), paper, *rates])
+        rows.append([row.title, f"`{row.name}`", row.sees, levels, *_cost(points_of(row)), paper, *rates])
     return _table(header, rows)
 
 

@@ -36,7 +36,8 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, mo
     write(row.run(1), 3, 4, {"agent": "a" * 64})
     page = results.rebuild(folder).read_text()
     rates = "75.0 % (30.1 to 95.4)" + 4 * " | not measured"
-    assert f"| MPO, asym. | o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 0.5 | 5 days, 256 actors | 4 | {rates} |" in page
+    cells = "o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 0.5 | 5 days, 256 actors | 4"
+    assert f"| MPO, asym. | `mpo_easy` | {cells} | {rates} |" in page
     assert (folder / "baselines.png").stat().st_size and "--agent" in row.run(1).options()
     with pytest.raises(ValueError, match="nobody=x: expected NAME=RUN with a name among modular, mpo_hard"):
         baselines.main(["nobody=x"])
@@ -109,7 +110,8 @@ def test_the_fine_tuned_stack_has_a_row_and_its_failures_beside_what_it_came_fro
     write(runs.POLICY_ALONE[0], 3, 4, began)
     write(run, 2, 4, after)
     page = results.rebuild(folder).read_text()
-    assert "| modular, fine-tuned as a whole | o_cam, o_pr, o_pos |" in page and "50.0 % (15.0 to 85.0)" in page
+    assert "| modular, fine-tuned as a whole | `joint` | o_cam, o_pr, o_pos |" in page
+    assert "50.0 % (15.0 to 85.0)" in page
     failures = page.split("before fine-tuning as a whole and after")[1].split("##")[0]
     assert "| default, the planner's policy alone |" in failures and "| modular, fine-tuned as a whole |" in failures
 
@@ -170,7 +172,7 @@ def test_table_1_has_a_floor_that_is_measured_without_a_training(folder, monkeyp
     write(measured[1], 1, 4, {"agent": "mujoban_baselines.agents:untrained"})
     page = results.rebuild(folder).read_text()
     cells = "o_cam, o_pr, o_pos | nothing | - | - | - | not there | 4 | 25.0 % (4.6 to 69.9) | not measured"
-    assert f"| MPO untrained: its noise, pink, held for 4 ticks | {cells}" in page
+    assert f"| MPO untrained: its noise, pink, held for 4 ticks | `untrained` | {cells}" in page
     with pytest.raises(ValueError, match="random=x: expected NAME=RUN"):
         baselines.main(["random=x"])
 
@@ -223,7 +225,8 @@ def test_another_seed_of_a_row_is_shown_where_it_was_measured(folder):
     again.curve.write_text(json.dumps(point))
     write(again.run(1), 3, 4, {})
     page = results.rebuild(folder).read_text()
-    assert "| MPO, asym., seed 1 | o_cam, o_pr, o_pos | easy |" in page and "75.0 % (30.1 to 95.4)" in page
+    assert "| MPO, asym., seed 1 | `mpo_easy_seed1` | o_cam, o_pr, o_pos | easy |" in page
+    assert "75.0 % (30.1 to 95.4)" in page
 
 
 def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_path):
@@ -245,7 +248,8 @@ def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_pat
     page = results.rebuild(folder).read_text()
     cells = "1.50 M | 1.0 | 0.5 | 7 days, 200 to 1,000 actors a module | 4 |" + 4 * " not measured |"
     cells += " 50.0 % (15.0 to 85.0)"
-    assert f"| modular | o_cam, o_pr, o_pos | all difficulties, bottom-up ([how](../weights.md)) | {cells} |" in page
+    trained = "o_cam, o_pr, o_pos | all difficulties, bottom-up ([how](../weights.md))"
+    assert f"| modular | `modular` | {trained} | {cells} |" in page
 
 
 def test_rows_of_agents_that_are_told_the_truth_say_so_in_table_and_legend():

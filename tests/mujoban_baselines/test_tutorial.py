@@ -104,7 +104,7 @@ def test_the_row_of_the_tutorial_and_its_curve_are_on_the_page(folder, tmp_path,
     row.run(1).file.write_text(json.dumps(measured))
     cells = "| 2.00 M | 1.0 | 0.5 | not there | 4 | 75.0 % (30.1 to 95.4)"
     page = page_of(folder)
-    assert f"| V-trace on the map (privileged) | o_pr, o_pos, s_abst | easy {cells} |" in page
+    assert f"| V-trace on the map (privileged) | `map_agent` | o_pr, o_pos, s_abst | easy {cells} |" in page
     assert f"    {row.commands[0]}\n" in page and baselines.JOINT.name == "joint"
     assert drawn[-1] == "V-trace on the map (privileged) (easy)" and (folder / "baselines.png").exists()
     assert runs.is_current(row.run(1), 4)
