@@ -13,7 +13,7 @@ from mujoban_core.files import digest
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import PRIVILEGED, ROLES, load_module, shipped_weights
 from mujoban_core.program import read_options
-from mujoban_core.stats import wilson_interval
+from mujoban_core.stats import paired_difference, wilson_interval
 
 
 def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, monkeypatch):
@@ -136,9 +136,15 @@ def test_failures_of_the_fine_tuned_stack_are_compared_with_what_it_came_from_al
     note_a_joint_run(folder, then)
     compared = told(then, after)
     assert f"| default, the planner's policy alone{tables.STALE} |" in compared, "other weights ship by now"
+    low, high = (f"{100 * bound:+.1f}" for bound in paired_difference(1, 0, 4)[1:])
+    gained = f"-25.0 points of success (95 % interval {low} to {high}); 1 were solved before alone, 0 after alone."
+    assert f"\n\nFine-tuned less before, on the same 4 levels: {gained}\n" in compared
+    others = "did not play with the weights with which the fine-tuning began, by the digests of"
     for role in ROLES:
-        assert told({**then, role: "7" * 64}, after) == "", f"another {role} before"
-    assert told(then, {**after, "estimator": "7" * 64}) == "", "another estimator after"
+        said = told({**then, role: "7" * 64}, after)
+        assert said.endswith(f"{others} {role}.\n") and said.count("\n") == 1, f"another {role} before"
+    said = told(then, {**after, "estimator": "7" * 64})
+    assert said.endswith(f"{others} estimator.\n") and said.count("\n") == 1, "another estimator after"
     baselines.JOINT.run(5).file.unlink()
     assert tables.fine_tuned() == ""
 
