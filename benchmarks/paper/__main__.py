@@ -59,8 +59,9 @@ and reports the best of many settings; here steps and CPU hours are what the row
 BUDGETS = f"""Rows trained on nothing are the floor. Every other one but that of the stack as it ships is given the
 environment steps of the modular row and its {HOURS:g} h of two cores, whichever is spent first: rows of less than
 {2 * HOURS:g} CPU hours were ended by their steps. To learn from each of them more often brought MPO there sooner, [not
-further](../research/baselines.md#torques-that-are-held). Not counted are the recording of what is cloned, and the
-weights of the stack that ships where a row begins with them.
+further](../research/baselines.md#torques-that-are-held); that is of one seed, up to 0.65 M steps, and says nothing of
+V-trace. Not counted are the recording of what is cloned, and the weights of the stack that ships where a row begins
+with them.
 `python -m benchmarks.paper.table1` trains and evaluates one row after the other, and goes on where it was stopped. Its
 commands are
 """
