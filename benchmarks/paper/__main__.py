@@ -75,8 +75,8 @@ them. Agents that learn by MPO or cloning are of size S; M and L: not trained.
 CURVES = """In training, with exploration; agents that learn by MPO with a limit of 45 s. Bars are 95 % intervals
 (Wilson) of the episodes that ended since the point before. What ended before each robot had played for the time limit
 is left out: all begin at once, and the first to end are those that were solved soon. A row that trains on one
-difficulty has a curve of that one, and a point is of 20 episodes at least. The modular row's learning is in Figure 4,
-module by module; cloning plays nothing while it learns.
+difficulty has a curve of that one, and a point is of 20 episodes at least. The modular row's learning is in [the report
+of its training](../research/one_hour/report.md), module by module; cloning plays nothing while it learns.
 """
 FIGURE_2 = """At every difficulty by the planner's policy alone, and as by default, with its search ahead. The rows of
 [Table 1](#table-1-main-results) are drawn as well, each with a marker of its own and a little aside.
@@ -184,7 +184,7 @@ def _figure_2(folder: Path) -> list[str]:
 
 def _baseline_curves(folder: Path) -> list[str]:
     if figures.baseline_curves(folder / "baselines.png"):
-        return [CURVES, "![Learning curves of agents](baselines.png)\n"]
+        return [CURVES, comparisons.short_curves(), "![Learning curves of agents](baselines.png)\n"]
     return _missing("The curves of agents", "python -m benchmarks.paper.baselines NAME=RUN")
 
 

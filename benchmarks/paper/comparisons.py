@@ -12,13 +12,25 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from benchmarks.paper.baselines import AGAIN, BASELINES, HOURS, MODULAR, Baseline, points_of, steps
+from benchmarks.paper.baselines import (
+    AGAIN,
+    BASELINES,
+    HOURS,
+    MODULAR,
+    Baseline,
+    joined,
+    points_of,
+    solved_in_training,
+    steps,
+)
 from benchmarks.paper.runs import load
 from mujoban_core.stats import NORMAL_95, cluster_variance, design_effect, wilson_interval
 from mujoban_sokoban.generator import generate_level
 
 _FLOOR: Final = "untrained"
 """The row that the others are compared with."""
+_FEW: Final = 100
+"""Episodes in training of which a curve says little."""
 _EASIEST: Final = 1
 """The difficulty whose levels come again, and the one at which agents differ."""
 
@@ -110,6 +122,17 @@ def against_floor() -> str:
         f"Against the floor, *{floor[0].title}*, at difficulty 1, in points of success with 95 % intervals (normal; "
         f"outcomes on the same seeds paired, errors clustered by distinct level; each row by itself): {told}\n"
     )
+
+
+def short_curves() -> str:
+    """Return which curves have few episodes of difficulty 1, and so few points; nothing where none has."""
+    found = ((row, points_of(row)) for row in (*BASELINES, *AGAIN))
+    told = [
+        f"{row.label}, {count} episodes and {len(joined(points, 'solved', _EASIEST))} points"
+        for row, points in found
+        if 0 < (count := solved_in_training(points, _EASIEST)[1]) < _FEW
+    ]
+    return f"Curves of few episodes, counted at difficulty 1: {'; '.join(told)}.\n" if told else ""
 
 
 def ended_by_steps() -> str:

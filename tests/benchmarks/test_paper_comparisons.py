@@ -58,6 +58,24 @@ def test_the_page_names_the_rows_that_are_above_what_nobody_trained(folder):
     assert "(hard), +0.5 (" in told.split("Not told apart")[1]
 
 
+def note(row, solved, episodes):
+    """Note a run of two points, the same share solved in both."""
+    counts = {"solved": {"1": solved}, "return": {"1": 0.0}, "episodes": {"1": episodes}}
+    points = [{"step": step, "cpu_seconds": 1, "seconds": 1, **counts} for step in (1, 2)]
+    row.curve.write_text("".join(json.dumps(point) + "\n" for point in points))
+
+
+def test_the_page_says_which_curves_are_of_few_episodes(folder):
+    rows = {row.name: row for row in baselines.BASELINES}
+    note(rows["mpo_easy"], 0.5, 50)
+    assert comparisons.short_curves() == ""
+    note(rows["vtrace"], 0.5, 25)
+    told = comparisons.short_curves()
+    vtrace = "V-trace (privileged) (curriculum), 50 episodes and 2 points"
+    assert told == f"Curves of few episodes, counted at difficulty 1: {vtrace}.\n"
+    assert told in results.rebuild(folder).read_text()
+
+
 def test_the_page_says_which_rows_their_steps_ended_and_which_seeds_there_are(folder):
     assert "their CPU time" not in (page := results.rebuild(folder).read_text())
     assert "A row is one run, of seed 0 where it names no other. Of another seed were run: none." in page
