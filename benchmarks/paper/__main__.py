@@ -127,6 +127,7 @@ def rebuild(folder: Path) -> Path:
         tables.baselines(),
         comparisons.distinct_levels(),
         comparisons.against_floor(),
+        comparisons.copying(),
         BUDGETS,
         tables.commands(BASELINES, RECORDING),
         comparisons.seeds(),

@@ -65,6 +65,25 @@ def note(row, solved, episodes):
     row.curve.write_text("".join(json.dumps(point) + "\n" for point in points))
 
 
+def test_the_page_says_whether_copying_helps_in_training_and_in_play_and_what_differs(folder):
+    rows = {row.name: row for row in baselines.BASELINES}
+    note(rows["mpo_cloned"], 0.4, 100)
+    for name, solved in (("mpo_cloned", 40), ("clone", 60), ("untrained", 50)):
+        assert comparisons.copying() == ""
+        write(rows[name].run(1), solved, 200, {"agent": "a" * 64})
+    assert comparisons.copying() == "", "nothing is known of what copied nothing"
+    note(rows["mpo_curriculum"], 0.25, 20)
+    told = comparisons.copying()
+    low, high = (f"{100 * bound:.1f}" for bound in wilson_interval(80, 200))
+    assert "It does in training" in told and f"solved 40.0 % of 200 ({low} to {high})" in told
+    assert "copied nothing 25.0 % of 40 (" in told
+    assert "the former solves 20.0 % of the test levels, the clone alone 30.0 %, the floor by its noise 25.0 %" in told
+    assert "above the floor: cloning of the stack alone." in told and told in results.rebuild(folder).read_text()
+    note(rows["mpo_curriculum"], 0.5, 20)
+    write(rows["clone"].run(1), 50, 200, {"agent": "a" * 64})
+    assert "It does not in training" in comparisons.copying() and "above the floor: neither." in comparisons.copying()
+
+
 def test_the_page_says_which_curves_are_of_few_episodes(folder):
     rows = {row.name: row for row in baselines.BASELINES}
     note(rows["mpo_easy"], 0.5, 50)
