@@ -207,8 +207,10 @@ def _agent(config: MPORunConfig, kind: type[RecurrentAgent]) -> RecurrentAgent:
             raise ValueError(f"--{name} {asked}: {start} holds weights of {name} {value}, expected that")
     if found.draws == config.draws:
         return found.train()
-    others = {name: value for name, value in found.config.items() if name != "draws"}
-    agent = kind(**others, **({} if config.draws is None else {"draws": config.draws}))
+    plays = {name: value for name, value in found.config.items() if name != "draws"}
+    if config.draws is not None:
+        plays["draws"] = config.draws
+    agent = kind(**plays)
     agent.load_state_dict(found.state_dict())
     return agent
 
