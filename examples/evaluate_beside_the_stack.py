@@ -1,9 +1,10 @@
 """Evaluate a policy of your own beside the stack: `python examples/evaluate_beside_the_stack.py [POLICY]`.
 
-POLICY is what examples/train_with_a_library.py wrote, by default `ppo_mujoban.zip`. It and the learned modules play the
-same levels, 32 easy ones for validation, and are judged alike. With `--oracle estimator,termination,planner,controller`
-oracles stand in for the modules. Load no file that you do not trust: it holds pickles, which may run any program.
-Other programs play the policy, too:
+Needs `pip install 'mujoban[examples]'`, and POLICY, by default `ppo_mujoban.zip`: run examples/train_with_a_library.py
+first, which writes it. It and the learned modules play the same levels, 32 easy ones for validation, and are judged
+alike: of both is printed how many they solved, with the interval, the mean return, and the seeds of the others by
+cause. With `--oracle estimator,termination,planner,controller` oracles stand in for the modules. Load no file that you
+do not trust: it holds pickles, which may run any program. Other programs play the policy, too:
 
     PYTHONPATH=examples python bringup/evaluate.py --agent evaluate_beside_the_stack:Trained --difficulty 1
 """

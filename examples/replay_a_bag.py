@@ -1,8 +1,10 @@
 """Read a recorded bag tick by tick, without ROS: `python examples/replay_a_bag.py BAG`.
 
-`bringup/run_stack.py --record BAG` and `bringup/record.py` write bags; `ros2 bag play BAG` plays one back as topics.
-Here its torques are applied again to the level, body and world that it names: all is the same to the last bit, if the
-world has room for as many boxes as the one that was recorded, which older bags do not say.
+Needs no more than Mujoban itself, and a bag: run `bringup/run_stack.py --record BAG` or `bringup/record.py --out BAG`
+first. (`ros2 bag play BAG` plays one back as topics.) Its torques are applied again to the level, body and world that
+it names. For each episode are printed its seed, its ticks, and how far the robot ever is from where it was recorded:
+0.0e+00, the same to the last bit, if the world has room for as many boxes as the one that was recorded, which older
+bags do not say.
 """
 
 from __future__ import annotations
@@ -43,7 +45,8 @@ def replay(bag: Bag) -> None:
     for ticks in episodes(bag, TOPICS, allow_test_seeds=True):  # nothing is learned from them
         spec = EpisodeSpec(Level.from_text(ticks[0][0].level), ticks[0][0].seed)
         boxes = int(bag.about.get("max_boxes", len(spec.level.boxes)))
-        world = World(1, body=body, world=name, max_boxes=boxes)
+        # An episode may have been recorded with more time than the body's, after which a world stands still.
+        world = World(1, body=body, world=name, max_boxes=boxes, time_limit=len(ticks))
         world.reset([0], [spec])
         apart = 0.0
         for _, pose, torque in ticks:
@@ -54,7 +57,7 @@ def replay(bag: Bag) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the example."""
-    for path in find_bags([read_options(Options, arguments, "replay_a_bag.py").bag]):
+    for path in find_bags([read_options(Options, arguments, "replay_a_bag.py", __doc__).bag]):
         replay(open_training_bag(path, TOPICS))
     return 0
 

@@ -2,7 +2,8 @@
 
 Needs `pip install 'mujoban[examples]'`. The library's PPO sees the robot's proprioception, its pose and the abstract
 state, since a camera policy takes days; `gymnasium.make("Mujoban-v0")` alone would be the task itself, and all else
-would stay as it is. The policy is written to `ppo_mujoban.zip`, which examples/evaluate_beside_the_stack.py plays.
+would stay as it is. Printed are the library's progress and, at the end, the mean return of two episodes. The policy is
+written to `ppo_mujoban.zip`, which examples/evaluate_beside_the_stack.py plays.
 """
 
 from __future__ import annotations

@@ -108,8 +108,8 @@ class VTraceLearner(Learner[Arrays]):
         for start in range(0, len(ticks["first"]), batch_size):
             part = {name: values[start : start + batch_size] for name, values in ticks.items()}
             meter.add(self._learn(part, guard))
-        if meter:
-            self.agent.sense.meet(ticks["proprio"][:, 0], self.config.normalised)
+        if meter and (sense := self.agent.sense) is not None:
+            sense.meet(ticks["proprio"][:, 0], self.config.normalised)
         return meter.take()
 
     def _learn(self, ticks: Mapping[str, Tensor], guard: NaNGuard) -> dict[str, float]:

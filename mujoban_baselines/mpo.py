@@ -190,7 +190,7 @@ class MPOLearner(Learner[Batch]):
         norm = guarded_step(loss, [self._adam, self._dual_adam], guard, clip=config.clip)
         if norm is None:
             return {}
-        self._normalise(batch["proprio"][:, 0])
+        self._normalise(batch)
         self._updates += 1
         if self._updates % config.target_period == 0:
             self.target_agent.load_state_dict(self.agent.state_dict())
@@ -240,13 +240,13 @@ class MPOLearner(Learner[Batch]):
         )
         return windowed_returns(reward, terminated, truncated, self.config.gamma)
 
-    def _normalise(self, proprio: Tensor) -> None:
+    def _normalise(self, batch: Batch) -> None:
         """Take in what is felt, for online and target networks alike: what they compute would differ otherwise."""
         senses = (self.agent.sense, self.target_agent.sense), (self.critic.sense, self.target_critic.sense)
         for online, target in senses:
             if online is None or target is None:
                 continue
-            if online.meet(proprio, self.config.normalised):
+            if online.meet(batch["proprio"][:, 0], self.config.normalised):
                 target.normaliser.load_state_dict(online.normaliser.state_dict())
 
 

@@ -156,8 +156,8 @@ class RecurrentAgent(nn.Module, Agent):
 
     @property
     @abstractmethod
-    def sense(self) -> BodySense:
-        """What reads proprioception; it is normalised by what training meets first."""
+    def sense(self) -> BodySense | None:
+        """What reads proprioception, normalised by what training meets first; None if the agent does not see it."""
 
     @abstractmethod
     def embed(self, sights: Mapping[str, Tensor]) -> Tensor:

@@ -40,7 +40,7 @@ from mujoban_core.program import read_options, run_command
 from mujoban_core.ranges import check_counts, check_positive
 from mujoban_core.threads import set_threads
 from mujoban_msgs_py.bags.training import bags_digest
-from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts
+from mujoban_rl.actors import ActorOptions, ActorSource, Rollouts, learner_generators
 from mujoban_rl.engine import Budget, Cadence, Learner, Source, Trainer
 from mujoban_rl.exploration import Exploration
 from mujoban_rl.run_directory import RunDirectory
@@ -102,7 +102,8 @@ class AgentRunConfig(PlayConfig):
     """Ticks for which each torque is held, in play as well (action repeat); returns, and windows, unrolls and the
     replay count decisions."""
     draws: Exploration | None = None
-    """Noise by which its torques are drawn in play, too, such as that by which it explores; None: their means."""
+    """Noise by which its torques are drawn in play, too, such as that by which it explores, whatever weights to start
+    from were drawn by; None: their means."""
 
     @property
     def play(self) -> dict[str, Any]:
@@ -174,27 +175,44 @@ def mpo_parts(
 ) -> Parts:  # fmt: skip
     """Return learner and source of MPO (paper D.1) with an agent of a kind, on Mujoban or on a task of one's own."""
     torch.manual_seed(config.seed)  # the initial weights
-    body, mpo = config.task.body, config.mpo
-    sizes = {"size": config.size} if kind is MonolithicAgent else {}
-    if not sizes and config.size != MPORunConfig.size:
-        raise ValueError(f"--size {config.size}: {kind.__name__} has no sizes")
-    if config.start is None:
-        agent = kind(body, **sizes, **config.play)  # pyright: ignore[reportCallIssue]
-    else:
-        agent = load_weights(kind, config.start, body=body).train()
-        for name in (*sizes, "repeat", "draws"):
-            if (held := agent.config.get(name)) != (asked := getattr(config, name)):
-                raise ValueError(f"--{name} {asked}: {config.start} holds weights of {name} {held}, expected that")
+    body, mpo, agent = config.task.body, config.mpo, _agent(config, kind)
     build = partial(kind, **agent.config)
     critic: Critic = AsymmetricCritic(body) if config.critic == "asymmetric" else SymmetricCritic(body, agent.width)
-    streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence(config.seed).spawn(2)]
-    generators = [torch.Generator().manual_seed(seed) for seed in streams]
+    generators = learner_generators(config.seed, 2)
     plays = task or partial(MujobanTask, config.task)
     factory = partial(make_actor, plays, build, mpo.window, mpo.overlap, critic.sees, mpo.exploration, config.seed)
     store = WindowStore(mpo, generators[0])
     steps = agent.repeat * mpo.steps_per_update
     source = ActorSource(actors.pool(factory), store, steps_per_update=steps, first_steps=mpo.first)
     return MPOLearner(agent, critic, mpo, generators[1]), source
+
+
+def _agent(config: MPORunConfig, kind: type[RecurrentAgent]) -> RecurrentAgent:
+    """Return the agent of a kind that a run trains: a new one, or what its weights to start from are of.
+
+    Raises:
+        ValueError: If the weights do not fit, are of another size, or of torques that are held for other ticks.
+    """
+    body, start = config.task.body, config.start
+    sizes = {"size": config.size} if kind is MonolithicAgent else {}
+    if not sizes and config.size != MPORunConfig.size:
+        raise ValueError(f"--size {config.size}: {kind.__name__} has no sizes")
+    if start is None:
+        return kind(body, **sizes, **config.play)  # pyright: ignore[reportCallIssue]
+    found = load_weights(kind, start, body=body)
+    # Weights of a class that takes no `repeat` do not name it: it is the class's own then.
+    held = {**{name: found.config.get(name) for name in sizes}, "repeat": found.repeat}
+    for name, value in held.items():
+        if value != (asked := getattr(config, name)):
+            raise ValueError(f"--{name} {asked}: {start} holds weights of {name} {value}, expected that")
+    if found.draws == config.draws:
+        return found.train()
+    plays = {name: value for name, value in found.config.items() if name != "draws"}
+    if config.draws is not None:
+        plays["draws"] = config.draws
+    agent = kind(**plays)
+    agent.load_state_dict(found.state_dict())
+    return agent
 
 
 def vtrace_parts(

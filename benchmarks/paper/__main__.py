@@ -39,6 +39,7 @@ INTRODUCTION = f"""# Results
 
     python -m benchmarks.paper.runs                    # everything: hours on two cores; goes on where it was ended
     python -m benchmarks.paper.runs --only NAME        # one row, by the name in its table, film_strip or film_strip_ant
+    python -m benchmarks.paper.runs --only NAME_1      # an agent of Table 1 by that name, at difficulty 1
     python -m benchmarks.paper.curves --help           # learning curves from the run directories of trainers
 
 Rows are of the *{DEFAULT_WORLD}* world, the environment that the paper's authors released, as measured in its recorded
@@ -58,8 +59,9 @@ and reports the best of many settings; here steps and CPU hours are what the row
 BUDGETS = f"""Rows trained on nothing are the floor. Every other one but that of the stack as it ships is given the
 environment steps of the modular row and its {HOURS:g} h of two cores, whichever is spent first: rows of less than
 {2 * HOURS:g} CPU hours were ended by their steps. To learn from each of them more often brought MPO there sooner, [not
-further](../research/baselines.md#torques-that-are-held). Not counted are the recording of what is cloned, and the
-weights of the stack that ships where a row begins with them.
+further](../research/baselines.md#torques-that-are-held); that is of one seed, up to 0.65 M steps, and says nothing of
+V-trace. Not counted are the recording of what is cloned, and the weights of the stack that ships where a row begins
+with them.
 `python -m benchmarks.paper.table1` trains and evaluates one row after the other, and goes on where it was stopped. Its
 commands are
 """
@@ -73,10 +75,11 @@ them. Agents that learn by MPO or cloning are of size S; M and L: not trained.
 CURVES = """In training, with exploration; agents that learn by MPO with a limit of 45 s. Bars are 95 % intervals
 (Wilson) of the episodes that ended since the point before. What ended before each robot had played for the time limit
 is left out: all begin at once, and the first to end are those that were solved soon. A row that trains on one
-difficulty has a curve of that one, and a point is of 20 episodes at least. The modular row's learning is in Figure 4,
-module by module; cloning plays nothing while it learns.
+difficulty has a curve of that one, and a point is of 20 episodes at least. The modular row's learning is in [the report
+of its training](../research/one_hour/report.md), module by module; cloning plays nothing while it learns.
 """
-FIGURE_2 = """At every difficulty by the planner's policy alone, and as by default, with its search ahead.
+FIGURE_2 = """At every difficulty by the planner's policy alone, and as by default, with its search ahead. The rows of
+[Table 1](#table-1-main-results) are drawn as well, each with a marker of its own and a little aside.
 """
 FIGURE_4 = """The trainings of the [weights that ship](../weights.md#the-weights-that-ship), and in orange those of
 other networks. Runs of a module are drawn end to end, so that a curve may drop where one begins, and the axes of rates
@@ -130,6 +133,7 @@ def rebuild(folder: Path) -> Path:
         tables.baselines(),
         comparisons.distinct_levels(),
         comparisons.against_floor(),
+        comparisons.copying(),
         BUDGETS,
         tables.commands(BASELINES, RECORDING),
         comparisons.seeds(),
@@ -193,7 +197,7 @@ def _figure_2(folder: Path) -> list[str]:
 
 def _baseline_curves(folder: Path) -> list[str]:
     if figures.baseline_curves(folder / "baselines.png"):
-        return [CURVES, "![Learning curves of agents](baselines.png)\n"]
+        return [CURVES, comparisons.short_curves(), "![Learning curves of agents](baselines.png)\n"]
     return _missing("The curves of agents", "python -m benchmarks.paper.baselines NAME=RUN")
 
 

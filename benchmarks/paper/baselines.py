@@ -311,6 +311,13 @@ def solved_margins(points: Sequence[dict[str, Any]], difficulty: int) -> list[tu
     return margins
 
 
+def solved_in_training(points: Sequence[dict[str, Any]], difficulty: int) -> tuple[int, int]:
+    """Return how many episodes of a difficulty were solved of those that count in a curve, and how many these are."""
+    d = str(difficulty)
+    counts = [(point[_EPISODES].get(d, 0), point["solved"].get(d, 0.0)) for point in points]
+    return round(sum(count * mean for count, mean in counts)), sum(count for count, _ in counts)
+
+
 def _joined(points: Sequence[dict[str, Any]], kind: str, difficulty: int) -> list[tuple[int, float, int]]:
     """Return steps, means and numbers of episodes."""
     d = str(difficulty)

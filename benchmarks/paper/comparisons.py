@@ -12,13 +12,29 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Final, NamedTuple
 
-from benchmarks.paper.baselines import AGAIN, BASELINES, HOURS, MODULAR, Baseline, points_of, steps
+from benchmarks.paper.baselines import (
+    AGAIN,
+    BASELINES,
+    HOURS,
+    MODULAR,
+    Baseline,
+    joined,
+    points_of,
+    solved_in_training,
+    steps,
+)
 from benchmarks.paper.runs import load
 from mujoban_core.stats import NORMAL_95, cluster_variance, design_effect, wilson_interval
 from mujoban_sokoban.generator import generate_level
 
 _FLOOR: Final = "untrained"
 """The row that the others are compared with."""
+_COPIED: Final = "mpo_cloned"
+_UNCOPIED: Final = "mpo_curriculum"
+"""MPO on the same levels as `_COPIED`, from nothing."""
+_CLONE: Final = "clone"
+_FEW: Final = 100
+"""Episodes in training of which a curve says little."""
 _EASIEST: Final = 1
 """The difficulty whose levels come again, and the one at which agents differ."""
 
@@ -110,6 +126,47 @@ def against_floor() -> str:
         f"Against the floor, *{floor[0].title}*, at difficulty 1, in points of success with 95 % intervals (normal; "
         f"outcomes on the same seeds paired, errors clustered by distinct level; each row by itself): {told}\n"
     )
+
+
+def copying() -> str:
+    """Return whether a monolithic network does better that may copy, and what else differs; nothing until measured."""
+    rows, played = {row.name: row for row in BASELINES}, {row.name: episodes for row, episodes in _measured()}
+    learned = [solved_in_training(points_of(rows[name]), _EASIEST) for name in (_COPIED, _UNCOPIED)]
+    if not all(count for _, count in learned) or not {_COPIED, _CLONE, _FLOOR} <= played.keys():
+        return ""
+    (copied, of), (alone, of_alone) = learned
+    better = "It does" if copied / of > alone / of_alone else "It does not"
+    above = [rows[name].title for name in (_COPIED, _CLONE) if difference(played[name], played[_FLOOR]).low > 0.0]
+    return (
+        f"Does a monolithic network do better when it may copy? {better} in training, where torques are drawn and an "
+        f"episode has 45 s: of difficulty 1 *{rows[_COPIED].title}* solved {_share(copied, of)}, the row that learned "
+        f"on the same levels and copied nothing {_share(alone, of_alone)}. In play, by means and in 240 s, the former "
+        f"solves {_rate(played[_COPIED])} of the test levels, the clone alone {_rate(played[_CLONE])}, the floor by "
+        f"its noise {_rate(played[_FLOOR])}; above the floor: {', '.join(above) or 'neither'}. The rows differ in more "
+        "than what they began with: what goes on from a clone, and the clone, decide in every tick and play by their "
+        "means, as the stack does; the other rows of MPO hold each torque for 4 ticks, learn from each step four "
+        "times, and play by drawn pink noise. A clone that plays so is not measured.\n"
+    )
+
+
+def _share(solved: int, of: int) -> str:
+    low, high = (100 * bound for bound in wilson_interval(solved, of))
+    return f"{100 * solved / of:.1f} % of {of} ({low:.1f} to {high:.1f})"
+
+
+def _rate(episodes: Sequence[Mapping[str, Any]]) -> str:
+    return f"{100 * sum(entry['solved'] for entry in episodes) / len(episodes):.1f} %"
+
+
+def short_curves() -> str:
+    """Return which curves have few episodes of difficulty 1, and so few points; nothing where none has."""
+    found = ((row, points_of(row)) for row in (*BASELINES, *AGAIN))
+    told = [
+        f"{row.label}, {count} episodes and {len(joined(points, 'solved', _EASIEST))} points"
+        for row, points in found
+        if 0 < (count := solved_in_training(points, _EASIEST)[1]) < _FEW
+    ]
+    return f"Curves of few episodes, counted at difficulty 1: {'; '.join(told)}.\n" if told else ""
 
 
 def ended_by_steps() -> str:

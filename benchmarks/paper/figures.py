@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +27,10 @@ from mujoban_core.grid import DIFFICULTIES
 from mujoban_sim.presets import DEFAULT_WORLD
 
 _COLUMNS: Final = 4
+_MARKERS: Final = "s^v<>P*XdpH8"
+"""Of rows of Table 1 in Figure 2, other than the stack's."""
+_ASIDE: Final = 0.05
+"""How far apart they stand there."""
 _METHODS: Final = {"controller": "camera policy"}
 """What the curve of the weights that ship is called beside others."""
 _VARIANTS: Final = {
@@ -49,25 +54,30 @@ def difficulty(alone: Sequence[Run], ahead: Sequence[Run], file: Path) -> bool:
     measured_alone, measured_ahead = _measured(alone), _measured(ahead)
     if not (measured_alone or measured_ahead):
         return False
-    figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
+    figure, axes = plt.subplots(figsize=(10, 4.2), layout="constrained")
     learned = f"all four modules learned, {DEFAULT_WORLD} world,\n"
     draw_rates(axes, measured_alone, f"{learned}the planner's policy alone", "tab:blue", "o", 0.0)
     draw_rates(axes, measured_ahead, f"{learned}the default, with the search ahead", "tab:orange", "D", 0.08)
-    # The first four are the stack's two colours, dark and pale.
-    axes.set_prop_cycle(color=plt.get_cmap("tab20").colors[4:])  # pyright: ignore[reportAttributeAccessIssue]
-    for row in BASELINES:
-        measured = [(d, report) for d in DIFFICULTIES if (report := load(row.run(d))) is not None]
-        if measured:
-            rates = [report["success_rate"] for _, report in measured]
-            bars = list(zip(*(margins(report) for _, report in measured), strict=True))
-            x = [d for d, _ in measured]
-            axes.errorbar(x, rates, yerr=bars, capsize=2, marker=".", linewidth=1, label=row.label)
+    _draw_agents(axes)
     shown = (*measured_alone, *measured_ahead)
     paper = {(run.difficulty, run.paper_success) for run, _ in shown if run.paper_success is not None}
     if paper:
         axes.scatter(*zip(*paper, strict=True), marker="x", color="black", label="paper, its world", zorder=3)
     save_rates(figure, axes, file)
     return True
+
+
+def _draw_agents(axes: Axes) -> None:
+    """Draw the rows of Table 1, side by side, as many of them are alike, and each with a marker of its own."""
+    # The first four colours are the stack's two, dark and pale.
+    axes.set_prop_cycle(color=plt.get_cmap("tab20").colors[4:])  # pyright: ignore[reportAttributeAccessIssue]
+    found = [(row.label, _measured([row.run(d) for d in DIFFICULTIES])) for row in BASELINES]
+    drawn = [(label, measured) for label, measured in found if measured]
+    for i, ((label, measured), marker) in enumerate(zip(drawn, cycle(_MARKERS), strict=False)):
+        rates = [report["success_rate"] for _, report in measured]
+        bars = list(zip(*(margins(report) for _, report in measured), strict=True))
+        x = [run.difficulty + _ASIDE * (i - (len(drawn) - 1) / 2) for run, _ in measured]
+        axes.errorbar(x, rates, yerr=bars, capsize=2, marker=marker, markersize=5, linewidth=1, label=label)
 
 
 def _measured(runs: Sequence[Run]) -> list[tuple[Run, dict[str, Any]]]:

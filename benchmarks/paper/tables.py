@@ -13,6 +13,7 @@ from bringup.results import Failure
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import ROLES
 from mujoban_core.reports import count_uses
+from mujoban_core.stats import paired_difference
 
 STALE = " †"
 """Marks a result of other weights than those that ship now."""
@@ -56,10 +57,10 @@ def failures(runs: Sequence[Run]) -> str:
 
 
 def fine_tuned() -> str:
-    """Return why the stack fails before it is fine-tuned as a whole and after, where there is that to compare.
+    """Return why the stack fails before it is fine-tuned as a whole and after, and what it gained; nothing until noted.
 
     What is compared is the fine-tuned stack and that from which it came: where the row before was played with other
-    weights than those from which the tuning began, as the run that was noted says, the two tell nothing of it.
+    weights than those from which the tuning began, as the run that was noted says, a line says that they are not.
     """
     before, after = POLICY_ALONE[0], JOINT.run(POLICY_ALONE[0].difficulty)
     reports, points = (load(before), load(after)), points_of(JOINT)
@@ -68,10 +69,26 @@ def fine_tuned() -> str:
         return ""
     played, tuned = (report["weights"] for report in reports if report)
     kept = ROLES.keys() - dict(after.modules)
-    if any(played.get(role) != began[role] for role in ROLES) or any(tuned.get(role) != began[role] for role in kept):
-        return ""
+    others = [r for r in ROLES if played.get(r) != began[r] or (r in kept and tuned.get(r) != began[r])]
+    if others:
+        return (
+            f"*{before.title}* and *{after.title}* are not compared: they did not play with the weights with which the "
+            f"fine-tuning began, by the digests of {', '.join(others)}.\n"
+        )
     head = f"Why episodes of difficulty {before.difficulty} fail, before fine-tuning as a whole and after:\n\n"
-    return head + failures((before, after))
+    return head + failures((before, after)) + _gained(*(report for report in reports if report))
+
+
+def _gained(before: dict[str, Any], after: dict[str, Any]) -> str:
+    """Return in a sentence by how much success after fine-tuning differs on the levels that were played before, too."""
+    (lost, won), levels = _solved_alone(before, after)
+    if not levels:
+        return ""
+    mean, low, high = (100 * value for value in paired_difference(len(lost), len(won), len(levels)))
+    return (
+        f"\nFine-tuned less before, on the same {len(levels)} levels: {mean:+.1f} points of success (95 % interval "
+        f"{low:+.1f} to {high:+.1f}); {len(lost)} were solved before alone, {len(won)} after alone.\n"
+    )
 
 
 def privileged(run: Run, report: dict[str, Any]) -> str:
@@ -84,13 +101,14 @@ def differences(one: Run, other: Run) -> str:
     reports = [load(run) for run in (one, other)]
     if None in reports:
         return ""
-    first, second = ({e["seed"]: e for e in report["episodes"]} for report in reports if report)
-    shared = sorted(first.keys() & second.keys())
+    told = [report for report in reports if report]
+    only, shared = _solved_alone(*told)
+    lost = [{e["seed"]: e["failure"] for e in report["episodes"]} for report in reversed(told)]
     named = [
-        ", ".join(f"{n} ({b[n]['failure']})" for n in shared if a[n]["solved"] and not b[n]["solved"]) or "none"
-        for a, b in ((first, second), (second, first))
+        ", ".join(f"{seed} ({causes[seed]})" for seed in seeds) or "none"
+        for seeds, causes in zip(only, lost, strict=True)
     ]
-    weights = [report["weights"] for report in reports if report]
+    weights = [report["weights"] for report in told]
     apart = sorted(dict(weights[0].items() ^ weights[1].items()))
     why = (
         f"They were played with other weights: {', '.join(apart)}."
@@ -102,6 +120,13 @@ def differences(one: Run, other: Run) -> str:
         f"Of {len(shared)} levels, solved by `{one.name}` alone: {named[0]}; by `{other.name}` alone: {named[1]} "
         f"(seeds, and what the other lost them by). {why}\n"
     )
+
+
+def _solved_alone(one: dict[str, Any], other: dict[str, Any]) -> tuple[list[list[int]], list[int]]:
+    """Return the seeds that either report alone solved, of the one and of the other, and those that both played."""
+    first, second = ({e["seed"]: e["solved"] for e in report["episodes"]} for report in (one, other))
+    shared = sorted(first.keys() & second.keys())
+    return [[seed for seed in shared if a[seed] and not b[seed]] for a, b in ((first, second), (second, first))], shared
 
 
 def test_uses(runs: Iterable[Run], films: Iterable[dict[str, Any] | None]) -> str:
@@ -125,16 +150,16 @@ def test_uses(runs: Iterable[Run], films: Iterable[dict[str, Any] | None]) -> st
 
 def baselines() -> str:
     """Return Table 1: the modular stack and what it is compared with, what each was trained on and how long."""
-    header = ["agent", "sees", "trained on", "steps", "CPU hours", "wall-clock", "paper", "n"]
+    header = ["agent", "name", "sees", "trained on", "steps", "CPU hours", "wall-clock", "paper", "n"]
     header += [f"difficulty {d}" for d in DIFFICULTIES]
     rates = _rates(DIFFICULTY)
     title = "modular, as it ships, the planner's policy alone"
-    rows = [[title, "o_cam, o_pr, o_pos", MODULAR_LEVELS, *_cost([]), MODULAR.paper, *rates]]
+    rows = [[title, MISSING, "o_cam, o_pr, o_pos", MODULAR_LEVELS, *_cost([]), MODULAR.paper, *rates]]
     for row in (*BASELINES, *(again for again in AGAIN if points_of(again))):
         paper = "; ".join(filter(None, (row.paper, _SAID.get(row.name))))
         rates = _rates([row.run(d) for d in DIFFICULTIES])
         levels = f"{row.levels} ([how]({row.guide}))" if row.guide else row.levels
-        rows.append([row.title, row.sees, levels, *_cost(points_of(row)), paper, *rates])
+        rows.append([row.title, f"`{row.name}`", row.sees, levels, *_cost(points_of(row)), paper, *rates])
     return _table(header, rows)
 
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -23,7 +22,7 @@ from mujoban_controller.mpo import MPOLearner
 from mujoban_controller.privileged import Critic
 from mujoban_planner.discrete_mpo import MPOBatch
 from mujoban_planner.move_learner import MoveLearner
-from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore
+from mujoban_rl.actors import ActorOptions, ActorSource, Experience, ReplayStore, learner_generators
 from mujoban_rl.engine import Learner, Scalars, State
 from mujoban_rl.limits import NaNGuard
 from mujoban_rl.replay import SequenceReplay, steps_per_update
@@ -31,8 +30,6 @@ from mujoban_rl.run_directory import RunDirectory
 from mujoban_rl.weights import load_weights, save_weights
 
 _CRITIC_WIDTH = 256
-_LEARNER = 0x6C6561
-"""Sets the learner's random streams apart from those of actors."""
 
 
 class JointBatch(NamedTuple):
@@ -151,9 +148,7 @@ def joint_parts(
         load_weights(VisuomotorController, start.path("controller", task.body), body=task.body),
         mujoban_planner.load(start.path("planner", task.body), compiled=False),
     )
-    # Not of [seed] alone, which is what NumPy makes of [seed, 0], the first actor's.
-    streams = [int(s.generate_state(1)[0]) for s in np.random.SeedSequence([_LEARNER, seed]).spawn(2)]
-    generators = [torch.Generator().manual_seed(stream) for stream in streams]
+    generators = learner_generators(seed, 2)
     factory = partial(make_actor, task, networks.plans(), start, settings, seed)
     own = settings.controller
     source = ActorSource(

@@ -10,7 +10,7 @@ A trainer needs two classes of its own: an `Actor` with a picklable factory, and
 from mujoban_rl.actors.actor import Actor, ActorError, ActorFactory, Arrays, Experience
 from mujoban_rl.actors.options import ActorOptions
 from mujoban_rl.actors.pool import ActorPool, Schedule
-from mujoban_rl.actors.source import ActorSource, ExperienceStore, ReplayStore, Rollouts
+from mujoban_rl.actors.source import ActorSource, ExperienceStore, ReplayStore, Rollouts, learner_generators
 
 __all__ = [
     "Actor",
@@ -25,4 +25,5 @@ __all__ = [
     "ReplayStore",
     "Rollouts",
     "Schedule",
+    "learner_generators",
 ]

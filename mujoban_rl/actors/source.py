@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,15 @@ from mujoban_rl.replay import SequenceReplay
 
 BatchT = TypeVar("BatchT")
 _BatchT_co = TypeVar("_BatchT_co", covariant=True)
+_LEARNER: Final = 0x6C6561
+"""Sets a learner's random streams apart from those of actors."""
+
+
+def learner_generators(seed: int, count: int) -> list[torch.Generator]:
+    """Return generators of a learner and its store, by the seed of a run, whose actors draw by `[seed, number]`."""
+    # Not of [seed] alone, which is what NumPy makes of [seed, 0], the first actor's.
+    streams = np.random.SeedSequence([_LEARNER, seed]).spawn(count)
+    return [torch.Generator().manual_seed(int(stream.generate_state(1)[0])) for stream in streams]
 
 
 class ExperienceStore(Protocol[_BatchT_co]):

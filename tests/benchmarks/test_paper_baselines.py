@@ -13,7 +13,7 @@ from mujoban_core.files import digest
 from mujoban_core.grid import DIFFICULTIES
 from mujoban_core.plugins import PRIVILEGED, ROLES, load_module, shipped_weights
 from mujoban_core.program import read_options
-from mujoban_core.stats import wilson_interval
+from mujoban_core.stats import paired_difference, wilson_interval
 
 
 def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, monkeypatch):
@@ -36,7 +36,8 @@ def test_table_1_has_a_row_for_each_agent_with_what_it_cost(folder, tmp_path, mo
     write(row.run(1), 3, 4, {"agent": "a" * 64})
     page = results.rebuild(folder).read_text()
     rates = "75.0 % (30.1 to 95.4)" + 4 * " | not measured"
-    assert f"| MPO, asym. | o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 0.5 | 5 days, 256 actors | 4 | {rates} |" in page
+    cells = "o_cam, o_pr, o_pos | easy | 0.01 M | 1.0 | 0.5 | 5 days, 256 actors | 4"
+    assert f"| MPO, asym. | `mpo_easy` | {cells} | {rates} |" in page
     assert (folder / "baselines.png").stat().st_size and "--agent" in row.run(1).options()
     with pytest.raises(ValueError, match="nobody=x: expected NAME=RUN with a name among modular, mpo_hard"):
         baselines.main(["nobody=x"])
@@ -109,7 +110,8 @@ def test_the_fine_tuned_stack_has_a_row_and_its_failures_beside_what_it_came_fro
     write(runs.POLICY_ALONE[0], 3, 4, began)
     write(run, 2, 4, after)
     page = results.rebuild(folder).read_text()
-    assert "| modular, fine-tuned as a whole | o_cam, o_pr, o_pos |" in page and "50.0 % (15.0 to 85.0)" in page
+    assert "| modular, fine-tuned as a whole | `joint` | o_cam, o_pr, o_pos |" in page
+    assert "50.0 % (15.0 to 85.0)" in page
     failures = page.split("before fine-tuning as a whole and after")[1].split("##")[0]
     assert "| default, the planner's policy alone |" in failures and "| modular, fine-tuned as a whole |" in failures
 
@@ -134,9 +136,15 @@ def test_failures_of_the_fine_tuned_stack_are_compared_with_what_it_came_from_al
     note_a_joint_run(folder, then)
     compared = told(then, after)
     assert f"| default, the planner's policy alone{tables.STALE} |" in compared, "other weights ship by now"
+    low, high = (f"{100 * bound:+.1f}" for bound in paired_difference(1, 0, 4)[1:])
+    gained = f"-25.0 points of success (95 % interval {low} to {high}); 1 were solved before alone, 0 after alone."
+    assert f"\n\nFine-tuned less before, on the same 4 levels: {gained}\n" in compared
+    others = "did not play with the weights with which the fine-tuning began, by the digests of"
     for role in ROLES:
-        assert told({**then, role: "7" * 64}, after) == "", f"another {role} before"
-    assert told(then, {**after, "estimator": "7" * 64}) == "", "another estimator after"
+        said = told({**then, role: "7" * 64}, after)
+        assert said.endswith(f"{others} {role}.\n") and said.count("\n") == 1, f"another {role} before"
+    said = told(then, {**after, "estimator": "7" * 64})
+    assert said.endswith(f"{others} estimator.\n") and said.count("\n") == 1, "another estimator after"
     baselines.JOINT.run(5).file.unlink()
     assert tables.fine_tuned() == ""
 
@@ -170,7 +178,7 @@ def test_table_1_has_a_floor_that_is_measured_without_a_training(folder, monkeyp
     write(measured[1], 1, 4, {"agent": "mujoban_baselines.agents:untrained"})
     page = results.rebuild(folder).read_text()
     cells = "o_cam, o_pr, o_pos | nothing | - | - | - | not there | 4 | 25.0 % (4.6 to 69.9) | not measured"
-    assert f"| MPO untrained: its noise, pink, held for 4 ticks | {cells}" in page
+    assert f"| MPO untrained: its noise, pink, held for 4 ticks | `untrained` | {cells}" in page
     with pytest.raises(ValueError, match="random=x: expected NAME=RUN"):
         baselines.main(["random=x"])
 
@@ -223,7 +231,8 @@ def test_another_seed_of_a_row_is_shown_where_it_was_measured(folder):
     again.curve.write_text(json.dumps(point))
     write(again.run(1), 3, 4, {})
     page = results.rebuild(folder).read_text()
-    assert "| MPO, asym., seed 1 | o_cam, o_pr, o_pos | easy |" in page and "75.0 % (30.1 to 95.4)" in page
+    assert "| MPO, asym., seed 1 | `mpo_easy_seed1` | o_cam, o_pr, o_pos | easy |" in page
+    assert "75.0 % (30.1 to 95.4)" in page
 
 
 def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_path):
@@ -245,7 +254,8 @@ def test_the_stack_of_the_same_hours_has_a_row_with_what_it_cost(folder, tmp_pat
     page = results.rebuild(folder).read_text()
     cells = "1.50 M | 1.0 | 0.5 | 7 days, 200 to 1,000 actors a module | 4 |" + 4 * " not measured |"
     cells += " 50.0 % (15.0 to 85.0)"
-    assert f"| modular | o_cam, o_pr, o_pos | all difficulties, bottom-up ([how](../weights.md)) | {cells} |" in page
+    trained = "o_cam, o_pr, o_pos | all difficulties, bottom-up ([how](../weights.md))"
+    assert f"| modular | `modular` | {trained} | {cells} |" in page
 
 
 def test_rows_of_agents_that_are_told_the_truth_say_so_in_table_and_legend():

@@ -58,6 +58,43 @@ def test_the_page_names_the_rows_that_are_above_what_nobody_trained(folder):
     assert "(hard), +0.5 (" in told.split("Not told apart")[1]
 
 
+def note(row, solved, episodes):
+    """Note a run of two points, the same share solved in both."""
+    counts = {"solved": {"1": solved}, "return": {"1": 0.0}, "episodes": {"1": episodes}}
+    points = [{"step": step, "cpu_seconds": 1, "seconds": 1, **counts} for step in (1, 2)]
+    row.curve.write_text("".join(json.dumps(point) + "\n" for point in points))
+
+
+def test_the_page_says_whether_copying_helps_in_training_and_in_play_and_what_differs(folder):
+    rows = {row.name: row for row in baselines.BASELINES}
+    note(rows["mpo_cloned"], 0.4, 100)
+    for name, solved in (("mpo_cloned", 40), ("clone", 60), ("untrained", 50)):
+        assert comparisons.copying() == ""
+        write(rows[name].run(1), solved, 200, {"agent": "a" * 64})
+    assert comparisons.copying() == "", "nothing is known of what copied nothing"
+    note(rows["mpo_curriculum"], 0.25, 20)
+    told = comparisons.copying()
+    low, high = (f"{100 * bound:.1f}" for bound in wilson_interval(80, 200))
+    assert "It does in training" in told and f"solved 40.0 % of 200 ({low} to {high})" in told
+    assert "copied nothing 25.0 % of 40 (" in told
+    assert "the former solves 20.0 % of the test levels, the clone alone 30.0 %, the floor by its noise 25.0 %" in told
+    assert "above the floor: cloning of the stack alone." in told and told in results.rebuild(folder).read_text()
+    note(rows["mpo_curriculum"], 0.5, 20)
+    write(rows["clone"].run(1), 50, 200, {"agent": "a" * 64})
+    assert "It does not in training" in comparisons.copying() and "above the floor: neither." in comparisons.copying()
+
+
+def test_the_page_says_which_curves_are_of_few_episodes(folder):
+    rows = {row.name: row for row in baselines.BASELINES}
+    note(rows["mpo_easy"], 0.5, 50)
+    assert comparisons.short_curves() == ""
+    note(rows["vtrace"], 0.5, 25)
+    told = comparisons.short_curves()
+    vtrace = "V-trace (privileged) (curriculum), 50 episodes and 2 points"
+    assert told == f"Curves of few episodes, counted at difficulty 1: {vtrace}.\n"
+    assert told in results.rebuild(folder).read_text()
+
+
 def test_the_page_says_which_rows_their_steps_ended_and_which_seeds_there_are(folder):
     assert "their CPU time" not in (page := results.rebuild(folder).read_text())
     assert "A row is one run, of seed 0 where it names no other. Of another seed were run: none." in page

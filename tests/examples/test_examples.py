@@ -1,22 +1,25 @@
 """Every example runs as it is printed."""
 
+import re
 import runpy
 import shutil
 import sys
 import tempfile
 from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bringup.evaluate import main as evaluate_main
 from bringup.rollout import ticks
 from bringup.rollout_recorder import Recorder
 from mujoban_baselines.random_agent import RandomAgent
 from mujoban_baselines.repeat import Repeating
 from mujoban_core.agent import OWN_SENSES, AgentInput, AgentPolicy
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.files import digest
 from mujoban_core.plugins import ROLES
 from mujoban_sim.presets import WORLDS
@@ -25,6 +28,7 @@ from mujoban_sokoban.episodes import EpisodeSpec
 from mujoban_sokoban.generator import PLAY_SEEDS, TRAIN_SEEDS, generate_level
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+POLICY_EXAMPLE = EXAMPLES / "evaluate_beside_the_stack.py"
 
 
 @pytest.fixture
@@ -52,7 +56,7 @@ def trained(run, tmp_path, monkeypatch):
 @pytest.fixture
 def agents():
     """Return what the evaluating example defines."""
-    return runpy.run_path(str(EXAMPLES / "evaluate_beside_the_stack.py"))
+    return runpy.run_path(str(POLICY_EXAMPLE))
 
 
 def make():
@@ -107,6 +111,14 @@ def test_a_policy_that_was_trained_on_the_task_itself_sees_what_the_robot_sees(r
     assert set(policy.sees) == set(OWN_SENSES) and policy.cameras == ("first_person",) and not policy.privileged
     said = run("evaluate_beside_the_stack.py", "--episodes", 1, "--time-limit", 5, "--oracle", ",".join(ROLES))
     assert "agent: " not in said.split("\nstack\n")[0]
+
+
+def test_other_programs_play_the_policy_by_the_command_that_is_printed(trained, monkeypatch, capsys):
+    (command,) = re.findall(r"PYTHONPATH=examples python bringup/evaluate\.py (.*)", POLICY_EXAMPLE.read_text())
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    assert evaluate_main([*command.split(), "--episodes", "1", "--time-limit", "5"]) == 0
+    assert "solved 0 of 1" in capsys.readouterr().out
+    sys.modules.pop(POLICY_EXAMPLE.stem)
 
 
 def test_a_policy_of_another_body_is_one_line(run, trained):
@@ -176,6 +188,17 @@ def test_a_bag_is_replayed_with_room_for_as_many_boxes_as_it_was_recorded_with(r
             recorder.write(tick)
     (bag,) = (tmp_path / "bag").iterdir()
     assert f"seed {spec.seed}: 200 ticks, at most 0.0e+00 apart" in run("replay_a_bag.py", bag)
+
+
+def test_a_bag_of_longer_episodes_than_the_bodys_is_replayed_to_their_end(run, tmp_path, monkeypatch):
+    spec = EpisodeSpec(generate_level(1, TRAIN_SEEDS.start), TRAIN_SEEDS.start)
+    agent = Repeating(RandomAgent(), 10, BALL.action_size)
+    with Recorder(tmp_path / "bag", BALL, [spec], [1]) as recorder:
+        for tick in ticks(AgentPolicy(agent), World(1, max_boxes=1, time_limit=40), [spec], camera=True):
+            recorder.write(tick)
+    (bag,) = (tmp_path / "bag").iterdir()
+    monkeypatch.setitem(BODIES, BALL.name, replace(BALL, time_limit=20))
+    assert run("replay_a_bag.py", bag) == f"seed {spec.seed}: 40 ticks, at most 0.0e+00 apart\n"
 
 
 def test_a_bag_of_levels_that_are_not_for_training_is_replayed_too(run, oracles, tmp_path):

@@ -96,6 +96,16 @@ def test_v_trace_learns_from_so_many_robots_at_a_time_until_each_had_its_turn(ba
     assert state == steps and math.isfinite(told["vtrace/value_loss"])
 
 
+def test_learner_and_actors_draw_from_streams_of_their_own():
+    config = MPORunConfig(seed=3, task=TaskConfig(robots=1), mpo=SMALL)
+    learner, source = mpo_parts(config, ActorOptions(), partial(SquaresTask, batch=1))
+    drawing = [learner._generator, source.store.generator]
+    for number in range(2):
+        actor = make_actor(partial(SquaresTask, batch=1), Informed, 6, 1, (), "white", config.seed, number)
+        drawing.append(actor._generator)
+    assert len({generator.initial_seed() for generator in drawing}) == len(drawing)
+
+
 class Blank(Critic):
     """Holds every action to be worth nothing."""
 

@@ -14,10 +14,11 @@ from benchmarks.paper import baselines, figures, runs, table1, tables
 from bringup.evaluate import evaluate
 from mujoban_baselines.mpo import MPOTrainingConfig
 from mujoban_baselines.task import TaskConfig
-from mujoban_baselines.train import COMMANDS, MPORunConfig, main, mpo_parts
+from mujoban_baselines.train import COMMANDS, PROG, MPORunConfig, main, mpo_parts
 from mujoban_core.agent import AgentPolicy
 from mujoban_core.files import digest
 from mujoban_core.plugins import load_module
+from mujoban_core.program import read_options
 from mujoban_rl.actors import ActorOptions
 from mujoban_sokoban.episodes import Episodes
 
@@ -103,7 +104,7 @@ def test_the_row_of_the_tutorial_and_its_curve_are_on_the_page(folder, tmp_path,
     row.run(1).file.write_text(json.dumps(measured))
     cells = "| 2.00 M | 1.0 | 0.5 | not there | 4 | 75.0 % (30.1 to 95.4)"
     page = page_of(folder)
-    assert f"| V-trace on the map (privileged) | o_pr, o_pos, s_abst | easy {cells} |" in page
+    assert f"| V-trace on the map (privileged) | `map_agent` | o_pr, o_pos, s_abst | easy {cells} |" in page
     assert f"    {row.commands[0]}\n" in page and baselines.JOINT.name == "joint"
     assert drawn[-1] == "V-trace on the map (privileged) (easy)" and (folder / "baselines.png").exists()
     assert runs.is_current(row.run(1), 4)
@@ -116,5 +117,7 @@ def page_of(folder):
 
 
 def test_every_command_of_the_guide_is_one():
-    named = set(re.findall(r"`([a-z]+(?:-[a-z]+)?) (?:--[a-z.-]+ \S+ )*--run", GUIDE))
-    assert named == COMMANDS.keys()
+    printed = [text.split() for text in re.findall(rf"`((?:{'|'.join(COMMANDS)}) [^`]*--run [^`]*)`", GUIDE)]
+    read = [read_options(COMMANDS, words, PROG) for words in printed]
+    assert [type(command) for command in read] == [COMMANDS[name] for name, *_ in printed]
+    assert {name for name, *_ in printed} == COMMANDS.keys() and len(printed) > len(COMMANDS)
