@@ -14,11 +14,11 @@ from mujoban_planner import curves as planner_curves
 def test_a_long_curve_is_thinned_to_means_that_weigh_instructions_alike(tmp_path):
     lines = [
         {"step": step, "instruction/move": float(step % 2), "instruction/move_n": 1 + 2 * (step % 2)}
-        for step in range(400)
+        for step in range(120)
     ]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     points = curves.read_curve("controller", [tmp_path])
-    assert len(points) == 200 and {p["value"] for p in points} == {0.75}
+    assert len(points) == 60 and {p["value"] for p in points} == {0.75}
 
 
 def test_curves_join_runs_and_average_rates_by_their_counts(tmp_path):
