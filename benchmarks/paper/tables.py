@@ -87,7 +87,7 @@ def _gained(before: dict[str, Any], after: dict[str, Any]) -> str:
     mean, low, high = (100 * value for value in paired_difference(len(lost), len(won), len(levels)))
     return (
         f"\nFine-tuned less before, on the same {len(levels)} levels: {mean:+.1f} points of success (95 % interval "
-        f"{low:+.1f} to {high:+.1f}); {len(lost)} were solved before alone, {len(won)} after alone.\n"
+        f"{low:+.1f} to {high:+.1f}); solved before alone: {len(lost)}, after alone: {len(won)}.\n"
     )
 
 

@@ -137,7 +137,7 @@ def test_failures_of_the_fine_tuned_stack_are_compared_with_what_it_came_from_al
     compared = told(then, after)
     assert f"| default, the planner's policy alone{tables.STALE} |" in compared, "other weights ship by now"
     low, high = (f"{100 * bound:+.1f}" for bound in paired_difference(1, 0, 4)[1:])
-    gained = f"-25.0 points of success (95 % interval {low} to {high}); 1 were solved before alone, 0 after alone."
+    gained = f"-25.0 points of success (95 % interval {low} to {high}); solved before alone: 1, after alone: 0."
     assert f"\n\nFine-tuned less before, on the same 4 levels: {gained}\n" in compared
     others = "did not play with the weights with which the fine-tuning began, by the digests of"
     for role in ROLES:
