@@ -70,8 +70,9 @@ recordings; what its planner plays under the abstract rules costs CPU time alone
 the two cores of the modular row computed in bfloat16. The stack fine-tuned as a whole learned on slower cores, which
 take three times the CPU time for an update of it: its CPU hours ended it. All rows had other trainings beside, hence
 their times by the clock. Of the modular row's modules the controller is the one that solved the most validation levels,
-the planner a moving average of its weights; the stack fine-tuned as a whole is a moving average as well; the senses and
-all agents are as their training left them. Agents that learn by MPO or cloning are of size S; M and L: not trained.
+the planner a moving average of its weights, as is the controller of the stack fine-tuned as a whole; the senses, all
+agents and the fine-tuned planner are as their training left them. Agents that learn by MPO or cloning are of size S; M
+and L: not trained.
 """
 CURVES = """In training, with exploration; agents that learn by MPO with a limit of 45 s. Bars are 95 % intervals
 (Wilson) of the episodes that ended since the point before. What ended before each robot had played for the time limit
