@@ -75,10 +75,10 @@ def thinking_milliseconds(thinking: int, seconds: float) -> dict[str, float]:
     return decision_milliseconds(planner, seconds)
 
 
-def all_sides_milliseconds(seconds: float) -> dict[str, float]:
-    """Return the same of the planner that ships where a decision looks from all sides, as before a doubtful push."""
+def all_sides_milliseconds(thinking: int, seconds: float) -> dict[str, float]:
+    """Return the same where a decision looks from all sides, as before a doubtful push."""
     planner = load(SHIPPED)
-    planner.doubt = -1.0  # whatever is said of it
+    planner.thinking, planner.doubt = thinking, -1.0  # whatever is said of it
     states = abstract_states(generate_batch(5, range(128)))
     _, memory = planner.decide(states, planner.initial_memory(len(states)))
     _, means = split_memory(memory)
@@ -184,7 +184,8 @@ def measure(options: Options) -> dict[str, Any]:
             "shipped, without its graph": decision_milliseconds(load(SHIPPED, compiled=False), options.seconds),
             "shipped, thinking 2": thinking_milliseconds(2, options.seconds),
             "shipped, thinking 4": thinking_milliseconds(4, options.seconds),
-            "shipped, from all eight sides": all_sides_milliseconds(options.seconds),
+            "shipped, from all eight sides": all_sides_milliseconds(1, options.seconds),
+            "shipped, thinking 4, from all eight sides": all_sides_milliseconds(4, options.seconds),
         },
         "training_samples_per_second": {
             "residual 64x8": training_samples_per_second(ImitationConfig(), options),

@@ -72,7 +72,10 @@ class LearnedPlanner(Compilable, Planner):
         self.caution = CAUTION
         """Weight of the verdicts on pushes and instructions in a decision; 1 is as trained."""
         self.doubt = DOUBT
-        """Probability that a push is deadly from which on the planner looks from every side before it; 1 is never."""
+        """Probability that a push is deadly from which on the planner looks from every side before it; 1 is never.
+
+        Longer thinking doubts sooner: its odds are divided by `thinking`.
+        """
 
     @property
     def device(self) -> torch.device:
@@ -160,13 +163,17 @@ class LearnedPlanner(Compilable, Planner):
         decision = np.argmax(scores, axis=1)
         for _ in range(self.perspectives - 1):
             again = means.views < self.perspectives
-            rows = np.flatnonzero(again & doubtful(abstract_state, decision, means, self.doubt))
+            rows = np.flatnonzero(again & doubtful(abstract_state, decision, means, self._least_doubt()))
             if not rows.size:
                 break
             part = VisitCounts(*take_rows(counts, rows)), PushMeans(*take_rows(means, rows))
             scores, seen = self.scores(abstract_state[rows], *part)
             decision[rows], means = np.argmax(scores, axis=1), PushMeans(*put_rows(means, rows, seen))
         return decision, means
+
+    def _least_doubt(self) -> float:
+        """Return the probability of `doubt`, its odds divided by the thinking time."""
+        return self.doubt / (self.doubt + self.thinking * (1.0 - self.doubt))
 
     @torch.inference_mode()
     def scores(

@@ -340,9 +340,17 @@ def test_a_small_doubt_about_a_push_counts_in_a_decision():
 
 def test_planner_that_doubts_nothing_looks_once():
     planner = Doubtful(0.1).eval()
-    planner.doubt = 1.0
+    planner.doubt, planner.thinking = 1.0, 4
     planner.decide(_before_a_push("#  $     #"), planner.initial_state(np.zeros(1, np.int64)).memory)
     assert planner.looks == [[0]]
+
+
+@pytest.mark.parametrize(("thinking", "looks"), [(1, 1), (4, SYMMETRIES)])
+def test_a_planner_that_thinks_longer_looks_again_at_a_smaller_doubt(thinking, looks):
+    planner = Doubtful(0.01).eval()  # half of what is doubted by default
+    planner.thinking = thinking
+    planner.decide(_before_a_push("#  $     #"), planner.initial_state(np.zeros(1, np.int64)).memory)
+    assert len(planner.looks) == looks
 
 
 def test_only_robots_in_doubt_look_again():
