@@ -32,9 +32,9 @@ $(INSTALLED): $(INPUTS) bringup/check_machine.py
 	@# What builds the messages is needed to run, too: no environment of its own for it.
 	@$(BIN)/python -c "import tomllib; \
 	  print(*tomllib.load(open('pyproject.toml', 'rb'))['build-system']['requires'], sep='\n')" > .venv/build-requires.txt
+	@# Python compiles the bytecode of what is imported: a seventh of what is installed.
 	$(BIN)/python -m pip install --quiet --no-compile --requirement .venv/build-requires.txt
 	$(BIN)/python -m pip install --quiet --no-compile --no-build-isolation --editable '.[dev]'
-	@$(BIN)/python -m compileall -qq -j $$(nproc) .venv/lib/python3*/site-packages || true  # pip does so on one core; some files are templates
 	@touch $@
 
 $(STAMP): $(INSTALLED)
