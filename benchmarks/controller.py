@@ -41,7 +41,7 @@ from mujoban_rl.losses.returns import td_target
 from mujoban_rl.networks import Gaussian, gaussian, gaussian_layers
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import EpisodeSpec
-from mujoban_sokoban.generator import generate_level
+from mujoban_sokoban.generator import VALIDATION_SEEDS, generate_level
 
 
 @dataclass(frozen=True)
@@ -201,9 +201,10 @@ class RandomDrive:
     """Robots that are driven at random: half of them hold a torque for a while, half draw one in each step."""
 
     def __init__(self, seed: int, batch: int = 64, levels: int = 512) -> None:
-        """Play `levels` test levels of difficulty 5 over and over."""
+        """Play `levels` validation levels of difficulty 5 over and over."""
         self._rng = np.random.default_rng(seed)
-        self._pool = [EpisodeSpec(generate_level(5, seed + i), seed + i) for i in range(levels)]
+        seeds = VALIDATION_SEEDS[seed : seed + levels]
+        self._pool = [EpisodeSpec(generate_level(5, of_level), of_level) for of_level in seeds]
         self.world = World(batch)
         self._torque = np.zeros((batch, self.world.body.action_size), np.float32)
         self._reset(np.arange(batch))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from mujoban_planner.symmetry import SYMMETRIES
 from mujoban_planner.teacher import Teacher
 from mujoban_rl.precision import autocast
 from mujoban_rl.weights import save_weights
-from mujoban_sokoban.generator import generate_batch
+from mujoban_sokoban.generator import TRAIN_SEEDS, VALIDATION_SEEDS, generate_batch
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ def rate(step: Callable[[], object], seconds: float, device: str = "cpu") -> flo
 
 def decision_milliseconds(planner: LearnedPlanner, seconds: float) -> dict[str, float]:
     """Return median, 99th percentile and maximum of the time of one decision for one robot, ms."""
-    states, memory = abstract_states(generate_batch(5, range(16))), planner.initial_memory(1)
+    states, memory = abstract_states(generate_batch(5, VALIDATION_SEEDS[:16])), planner.initial_memory(1)
 
     def decide(count: int) -> None:
         nonlocal memory
@@ -79,7 +80,7 @@ def all_sides_milliseconds(thinking: int, seconds: float) -> dict[str, float]:
     """Return the same where a decision looks from all sides, as before a doubtful push."""
     planner = load(SHIPPED)
     planner.thinking, planner.doubt = thinking, -1.0  # whatever is said of it
-    states = abstract_states(generate_batch(5, range(128)))
+    states = abstract_states(generate_batch(5, VALIDATION_SEEDS[:128]))
     _, memory = planner.decide(states, planner.initial_memory(len(states)))
     _, means = split_memory(memory)
     states = states[means.views == planner.perspectives]  # those in which a push is decided on
@@ -137,7 +138,7 @@ def training_samples_per_second(config: ImitationConfig, options: Options) -> fl
 def environment_steps_per_second(options: Options, batch: int = 4096) -> float:
     """Return instructions per second of the abstract environment."""
     environment = AbstractEnvironment(batch, device=options.device)
-    states = torch.from_numpy(abstract_states(generate_batch(5, range(batch))))
+    states = torch.from_numpy(abstract_states(generate_batch(5, VALIDATION_SEEDS[:batch])))
     environment.reset_to(torch.arange(batch), states)
     instruction = torch.randint(1, 5, (batch,), generator=torch.Generator().manual_seed(0)).to(options.device)
     return batch * rate(lambda: environment.step(instruction), options.seconds, options.device)
@@ -145,7 +146,7 @@ def environment_steps_per_second(options: Options, batch: int = 4096) -> float:
 
 def pushes_per_cpu_second(options: Options, batch: int = 1024) -> float:
     """Return pushes per CPU second of the environment of pushes: masks, steps, resets and abstract states."""
-    environment, boards = PushEnvironment(batch), bit_boards(generate_batch(5, range(batch)))
+    environment, boards = PushEnvironment(batch), bit_boards(generate_batch(5, VALIDATION_SEEDS[:batch]))
     environment.reset_to(np.arange(batch), boards)
     rng, calls, spent = np.random.default_rng(0), 0, 0.0
     while spent < options.seconds:
@@ -164,7 +165,7 @@ def pushes_per_cpu_second(options: Options, batch: int = 1024) -> float:
 
 def demonstrations_per_second(options: Options) -> float:
     """Return labelled levels per second and core, generation included."""
-    teacher, rng, seeds = Teacher(), np.random.default_rng(0), iter(range(0, 10_000_000, 64))
+    teacher, rng, seeds = Teacher(), np.random.default_rng(0), itertools.count(TRAIN_SEEDS.start, 64)
 
     def step() -> None:
         first = next(seeds)

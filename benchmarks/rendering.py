@@ -26,6 +26,7 @@ from mujoban_sim.presets import DEFAULT_WORLD, EASED
 from mujoban_sim.scene import SceneCache
 from mujoban_sim.world import World
 from mujoban_sokoban.episodes import Episodes
+from mujoban_sokoban.generator import VALIDATION_SEEDS
 
 BATCH = 64
 THREADS = 2
@@ -48,7 +49,7 @@ class Options:
 
 
 def _make_world(threads: int, name: str = DEFAULT_WORLD) -> World:
-    episodes = Episodes(BATCH, seed=0, difficulty=DIFFICULTY)
+    episodes = Episodes(BATCH, VALIDATION_SEEDS.start, difficulty=DIFFICULTY)
     world = World(BATCH, world=name, max_boxes=episodes.max_boxes, threads=threads)
     world.reset(np.arange(BATCH), list(episodes))
     world.render()
