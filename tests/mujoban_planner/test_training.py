@@ -44,7 +44,7 @@ SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
 def _quick(monkeypatch):
     torch.set_num_threads(1)
     monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
-    monkeypatch.setattr("mujoban_planner.validation.play", partial(play, limit=20))
+    monkeypatch.setattr("mujoban_planner.validation.play", partial(play, limit=5))
 
 
 def _imitation(path, actors=None, **changes):
