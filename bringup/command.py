@@ -99,12 +99,13 @@ class Choice:
             ValueError: See `load`.
         """
         from mujoban_core.files import digest
-        from mujoban_rl.weights import WeightsError
 
         name = self.source
         if self.source == LEARNED:
             path = self.weights or shipped_weights(self.role)
             if not path.is_file():
+                from mujoban_rl.weights import WeightsError  # with PyTorch, which oracles play without
+
                 raise WeightsError(f"no weights of the {self.role} at {path}: expected --{self.role} FILE")
             name = digest(path)
         return f"{name}{PRIVILEGED if self.told else ''}"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
-from mujoban_rl.weights import provenance
+from mujoban_core.commit import commit_of
 from mujoban_sokoban.generator import seed_range
 
 
@@ -27,7 +28,7 @@ def noted_use(seeds: Collection[int], weights: Mapping[str, str], played: Mappin
     if seed_range(first, last - first + 1) != "test":
         return {}
     use = {
-        "commit": provenance()["commit"], "weights": dict(weights), "seeds": [first, last],
+        "commit": commit_of(Path(__file__)), "weights": dict(weights), "seeds": [first, last],
         "played": dict(played), "when": datetime.now(UTC).isoformat(timespec="seconds"),
     }  # fmt: skip
     return {"test_uses": [use]}

@@ -70,9 +70,9 @@ SMALL = {
     "mujoban_estimator.train": "--steps 1 --streams 1 --length 8 --workers 0",
     "mujoban_planner.train imitation": "--samples 4 --batch-size 4",
     "mujoban_planner.train mpo": "--updates 1 --batch-size 4",
-    "mujoban_controller.train --stage distil": "--steps 64 --evaluation-episodes 0 --distil.first 16 "
+    "mujoban_controller.train --stage distil": "--steps 16 --evaluation-episodes 0 --task.batch 2 --distil.first 16 "
     "--distil.windows 2",
-    "mujoban_controller.train --stage mpo": "--steps 64 --evaluation-episodes 0 --asymmetric.first 64 "
+    "mujoban_controller.train --stage mpo": "--steps 64 --evaluation-episodes 0 --task.batch 2 --asymmetric.first 64 "
     "--asymmetric.windows 2 --asymmetric.critic-first 1 --asymmetric.critic-windows 2",
 }
 """Budgets of a moment for each kind of command in the round of docs/bags.md."""

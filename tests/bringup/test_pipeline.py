@@ -123,8 +123,9 @@ def test_a_stopped_run_ends_its_commands_and_goes_on_where_it_was(tmp_path):
 def test_a_trainer_that_is_stopped_alone_is_not_done(tmp_path):
     folder = tmp_path / "train"
     product, metrics = folder / "planner.safetensors", folder / "metrics.jsonl"
-    small = ("--channels", "8", "--blocks", "1", "--run", str(folder))
-    run = Pipeline(tmp_path, [Stage("train", ("-m", "mujoban_planner.train", "expert-iteration", *small), (product,))])
+    small = "--channels 4 --blocks 1 --first-evaluations 128 --evaluations 1 --trees 16 --expansions 16 --batch-size 8"
+    command = ("-m", "mujoban_planner.train", "expert-iteration", *small.split(), "--run", str(folder))
+    run = Pipeline(tmp_path, [Stage("train", command, (product,))])
 
     told = []
 

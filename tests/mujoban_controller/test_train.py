@@ -22,7 +22,7 @@ from mujoban_controller.mpo import AsymmetricConfig, MPOTrainingConfig
 from mujoban_controller.ppo import PPOTrainingConfig, RolloutSource
 from mujoban_controller.privileged import Critic, PrivilegedPolicy
 from mujoban_controller.train import NetworkConfig, Options, TrainConfig, main, make_trainer
-from mujoban_core.bodies import BALL
+from mujoban_core.bodies import BALL, BODIES
 from mujoban_core.grid import Instruction
 from mujoban_rl.engine import CARRIED, Trainer
 from mujoban_rl.limits import NaNGuard
@@ -185,7 +185,8 @@ def test_a_network_unlike_the_one_that_training_begins_with_is_refused(tmp_path)
         make_trainer(Options(tmp_path / "other", config, evaluation_episodes=0))
 
 
-def test_the_best_product_on_validation_levels_is_exported(teacher, tmp_path):
+def test_the_best_product_on_validation_levels_is_exported(monkeypatch, tmp_path):
+    monkeypatch.setitem(BODIES, "ball", replace(BALL, time_limit=40))
     learner = make_trainer(Options(tmp_path, replace(STAGES["ppo"], steps=64), evaluation_episodes=2)).learner
     with torch.no_grad():
         for parameter in learner.policy.parameters():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,12 +19,19 @@ from mujoban_planner.bag_lessons import BagLessons, Lessons
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.imitation import ImitationConfig, imitation
 from mujoban_planner.lesson_source import LessonActor
+from mujoban_planner.play import play
 from mujoban_planner.reinforcement import MoveStore, MPOConfig, reinforcement
 from mujoban_rl.engine import CARRIED
 from mujoban_rl.run_directory import copy_light
 from mujoban_rl.testing import check_resuming
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
 from mujoban_sokoban.solver import solve_level
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
+    monkeypatch.setattr("mujoban_planner.validation.play", partial(play, limit=5))
 
 
 def play_and_record(path, seed, look_around=0):
@@ -77,14 +85,12 @@ def reinforced(path, bags, share):
 
 @pytest.mark.parametrize("make", [imitating, reinforced])
 def test_runs_from_bags_alone_make_nothing_else_and_resume_to_the_bit(make, bags, tmp_path, monkeypatch):
-    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
     for other in ("imitation.LessonSource", "reinforcement.MoveActor"):
         monkeypatch.setattr(f"mujoban_planner.{other}", None)
     check_resuming(lambda path: make(path, bags, 1.0), tmp_path, stop_at=3, updates=6)
 
 
-def test_lessons_and_bags_share_a_batch_and_resume_to_the_bit(bags, tmp_path, monkeypatch):
-    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
+def test_lessons_and_bags_share_a_batch_and_resume_to_the_bit(bags, tmp_path):
     trainers = []
 
     def make(path):
@@ -96,7 +102,6 @@ def test_lessons_and_bags_share_a_batch_and_resume_to_the_bit(bags, tmp_path, mo
 
 
 def test_a_run_with_bags_that_goes_on_from_a_light_copy_has_lessons_of_other_levels(bags, tmp_path, monkeypatch):
-    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
     streams = []
 
     class Noted(LessonActor):

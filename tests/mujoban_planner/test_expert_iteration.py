@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -51,15 +52,25 @@ def judged_pushes(samples: Samples):
 
 
 @pytest.fixture(scope="module")
-def audits():
-    """What is asked about play of a planner that wins."""
-    actor = SearchActor(NETWORK, replace(SMALL, trees=64), 0, 0)
+def winner():
+    """A planner that wins, and what searches deliver about its play, by the share that is kept of what is easy."""
+    actor = SearchActor(NETWORK, replace(SMALL, trees=64, audited=1.0), 0, 0)
     actor.planner = load(compiled=False)
-    delivered = [actor.act().arrays for _ in range(12)]
-    return concatenate([Samples._make(arrays[f"audit.{name}"] for name in Samples._fields) for arrays in delivered])
+    actor.planner.lay_out()
+    delivered = {}
+    for easy, acts in ((1.0, 2), (0.0, 3)):
+        actor.config = replace(actor.config, easy=easy)
+        delivered[easy] = [actor.act().arrays for _ in range(acts)]
+    return actor.planner, delivered
 
 
-def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons, audits):
+def samples_of(kinds, delivered):
+    """Return all samples of these kinds."""
+    return concatenate([Samples._make(x[f"{kind}.{n}"] for n in Samples._fields) for x in delivered for kind in kinds])
+
+
+def test_what_searches_prove_of_pushes_is_what_the_solver_says(lessons, winner):
+    audits = samples_of(["audit"], [*chain(*winner[1].values())])
     for kind, both, least in (("way", True, 30), ("verdict", False, 30), ("played", True, 3), ("audit", True, 3)):
         samples = (lessons | {"audit": audits})[kind]
         state, direction, square, deadly = judged_pushes(samples)
@@ -129,16 +140,9 @@ def test_a_buffer_holds_a_batch():
         SearchConfig(buffer=100)
 
 
-def test_of_the_lessons_those_are_kept_in_which_the_planner_errs():
-    erred = {}
-    for easy in (0.0, 1.0):
-        actor = SearchActor(NETWORK, replace(SMALL, trees=64, easy=easy), 0, 0)
-        actor.planner = load(compiled=False)
-        lessons = [actor.act().arrays for _ in range(4)]
-        samples = concatenate(
-            [Samples._make(x[f"{kind}.{name}"] for name in Samples._fields) for x in lessons for kind in KINDS]
-        )
-        erred[easy] = errs(actor.planner, samples)
+def test_of_the_lessons_those_are_kept_in_which_the_planner_errs(winner):
+    planner, delivered = winner
+    erred = {easy: errs(planner, samples_of(KINDS, lessons)) for easy, lessons in delivered.items()}
     assert erred[0.0].sum() > 0 and (~erred[0.0]).sum() < 3, "but for rounding, all"
     assert (~erred[1.0]).sum() > 3
 

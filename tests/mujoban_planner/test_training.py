@@ -25,6 +25,7 @@ from mujoban_planner.imitation import ImitationConfig, imitation, imitation_loss
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.moves import LevelStream
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
+from mujoban_planner.play import play
 from mujoban_planner.reinforcement import MPOConfig, MPOLearner, reinforcement, reset_stay_logit
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
@@ -43,10 +44,11 @@ SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
 def _quick(monkeypatch):
     torch.set_num_threads(1)
     monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
+    monkeypatch.setattr("mujoban_planner.validation.play", partial(play, limit=5))
 
 
 def _imitation(path, actors=None, **changes):
-    small = {"buffer": 50_000, "levels": 16, "stock": 4, "errors": 1.0}
+    small = {"buffer": 50_000, "levels": 16, "stock": 8, "errors": 1.0}
     return imitation(ImitationConfig(**SMALL | small | changes), path, Cadence(publish_updates=1), actors=actors)
 
 
