@@ -51,6 +51,8 @@ def export_graph(
     """
     if find_spec("onnxscript") is None:
         raise ModuleNotFoundError("exporting needs onnxscript, which is part of mujoban[dev]: pip install onnxscript")
+    with torch.no_grad():
+        function(*inputs)  # what it computes but once and keeps would be the tracer's own tensors
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         # Of PyTorch about its own parts.
