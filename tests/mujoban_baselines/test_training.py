@@ -360,7 +360,7 @@ class InformedCritic(Critic):
 def test_mpo_learns_to_walk_to_the_red_square_from_nothing():
     """The same by MPO, with the settings of the golden task."""
     torch.manual_seed(0)
-    settings = replace(golden.QUICK, windows=32, replay=6_000, first=500, samples=10)
+    settings = replace(golden.QUICK, replay=6_000, first=500, samples=10)
     learner = MPOLearner(Informed(), InformedCritic(), settings, torch.Generator().manual_seed(1))
     factory = partial(
         make_actor, partial(TellingSquares, batch=16), Informed, settings.window, settings.overlap,
