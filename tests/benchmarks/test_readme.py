@@ -83,5 +83,5 @@ def test_what_a_command_does_not_do_as_promised_is_told(tmp_path, line, limit, s
 
 @pytest.mark.parametrize("command", ["evaluate.py --planner my_planner", "run_stack.py --planner my_planner"])
 def test_a_module_that_the_readme_writes_plays_as_the_readme_says(command):
-    report = readme.run(Options(only=(command,), limit=4.0))
+    report = readme.run(Options(only=(command,), limit=8.0))
     assert report["in_order"] == 1 and len(report["commands"]) == 1, report["commands"]
