@@ -147,9 +147,17 @@ def test_what_is_no_graph_of_a_decision_is_named(small):
         mujoban_planner.load(small)
 
 
-def test_an_export_that_is_the_first_use_of_a_planner_takes_the_place_of_a_damaged_graph(small, recwarn):
+def test_an_export_that_is_the_first_use_of_a_planner_spoils_no_later_one(tmp_path):
     for kept in (symmetry._view_sources, symmetry._instruction_images, symmetry.push_images):
         kept.cache_clear()
+    planner, path = ResidualPlanner(4, 1), tmp_path / "small.safetensors"
+    save_weights(path, planner, planner.config, {})
+    export(path)
+    decision, _ = planner.decide(abstract_states(LEVELS), planner.initial_memory(len(LEVELS.wall)))
+    assert decision.shape == (len(LEVELS.wall),)
+
+
+def test_an_export_takes_the_place_of_a_damaged_graph(small, recwarn):
     graph_path(small).write_bytes(b"no graph")
     export(small)
     assert mujoban_planner.load(small).compiled is not None
