@@ -31,11 +31,11 @@ STAGES = {
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_body_that_was_never_heard_of_is_trained_and_judged(monkeypatch, stage, tmp_path):
     monkeypatch.setitem(BODIES, "cart", dataclasses.replace(CART, time_limit=20))
-    config = dataclasses.replace(STAGES[stage], steps=256)
-    trainer = make_trainer(Options(tmp_path, config, evaluation_episodes=1, evaluate_every=256))
+    config = dataclasses.replace(STAGES[stage], steps=512)
+    trainer = make_trainer(Options(tmp_path, config, evaluation_episodes=1, evaluate_every=512))
     world = trainer.source.task.world if stage == "ppo" else trainer.source.player.task.world
     start = world.pose.copy()
-    assert trainer.run() and trainer.progress.samples >= 256
+    assert trainer.run() and trainer.progress.samples >= 512
     assert np.abs(world.pose - start)[:, :2].max() > 0.01 and np.isfinite(world.proprio).all()
     product = tmp_path / f"{'controller' if stage == 'asymmetric' else 'teacher'}.safetensors"
     assert read_record(product)["config"]["body"] == "cart"
