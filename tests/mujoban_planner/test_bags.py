@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from mujoban_planner.bag_lessons import BagLessons, Lessons
 from mujoban_planner.bag_transitions import BagTransitions
 from mujoban_planner.imitation import ImitationConfig, imitation
 from mujoban_planner.lesson_source import LessonActor
-from mujoban_planner.play import play
 from mujoban_planner.reinforcement import MoveStore, MPOConfig, reinforcement
 from mujoban_rl.engine import CARRIED
 from mujoban_rl.run_directory import copy_light
@@ -27,11 +25,7 @@ from mujoban_rl.testing import check_resuming
 from mujoban_sokoban.generator import TRAIN_SEEDS, generate_level
 from mujoban_sokoban.solver import solve_level
 
-
-@pytest.fixture(autouse=True)
-def _quick(monkeypatch):
-    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
-    monkeypatch.setattr("mujoban_planner.validation.play", partial(play, limit=5))
+pytestmark = pytest.mark.usefixtures("short_validation")
 
 
 def play_and_record(path, seed, look_around=0):

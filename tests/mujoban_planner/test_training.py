@@ -25,7 +25,6 @@ from mujoban_planner.imitation import ImitationConfig, imitation, imitation_loss
 from mujoban_planner.lessons import LessonMaker
 from mujoban_planner.moves import LevelStream
 from mujoban_planner.networks import RecurrentPlanner, ResidualPlanner, ThinkingPlanner
-from mujoban_planner.play import play
 from mujoban_planner.reinforcement import MPOConfig, MPOLearner, reinforcement, reset_stay_logit
 from mujoban_planner.samples import make_batch
 from mujoban_planner.uncertainty import blur, hide_unseen
@@ -41,10 +40,8 @@ SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
 
 
 @pytest.fixture(autouse=True)
-def _quick(monkeypatch):
+def _quick(short_validation):
     torch.set_num_threads(1)
-    monkeypatch.setattr("mujoban_planner.validation._EPISODES", {1: 4})
-    monkeypatch.setattr("mujoban_planner.validation.play", partial(play, limit=5))
 
 
 def _imitation(path, actors=None, **changes):
