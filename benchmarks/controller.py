@@ -203,8 +203,7 @@ class RandomDrive:
     def __init__(self, seed: int, batch: int = 64, levels: int = 512) -> None:
         """Play `levels` validation levels of difficulty 5 over and over."""
         self._rng = np.random.default_rng(seed)
-        seeds = VALIDATION_SEEDS[seed : seed + levels]
-        self._pool = [EpisodeSpec(generate_level(5, of_level), of_level) for of_level in seeds]
+        self._pool = [EpisodeSpec(generate_level(5, level), level) for level in VALIDATION_SEEDS[:levels]]
         self.world = World(batch)
         self._torque = np.zeros((batch, self.world.body.action_size), np.float32)
         self._reset(np.arange(batch))

@@ -77,7 +77,7 @@ def thinking_milliseconds(thinking: int, seconds: float) -> dict[str, float]:
 
 
 def all_sides_milliseconds(thinking: int, seconds: float) -> dict[str, float]:
-    """Return the same where a decision looks from all sides, as before a doubtful push."""
+    """Return the same of it where a decision looks from all sides, as before a doubtful push."""
     planner = load(SHIPPED)
     planner.thinking, planner.doubt = thinking, -1.0  # whatever is said of it
     states = abstract_states(generate_batch(5, VALIDATION_SEEDS[:128]))
