@@ -1,4 +1,4 @@
-"""What all tests share: a private ROS domain on loopback, checked message fields, one software-rendering thread."""
+"""What all tests share: a private ROS domain on loopback, checked message fields, one thread for numbers and images."""
 
 import os
 import sys
@@ -13,12 +13,15 @@ os.environ.setdefault("LP_NUM_THREADS", "0")
 import pytest
 from hypothesis import HealthCheck, settings
 
+from mujoban_core.threads import set_threads
 from mujoban_msgs_py.runtime.discovery import PROFILES, RANGE, confine_discovery
 
 # Before ROS is initialised, here or in a child process.
 for name in (RANGE, PROFILES):
     os.environ.pop(name, None)
 confine_discovery()
+# Tests run beside each other, and threads of one network that wait for each other on busy cores take all of these.
+set_threads(1)
 
 # How long a machine takes that has other work is no finding.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -27,6 +30,13 @@ settings.load_profile("any machine")
 IMPORTABLE = str(Path(__file__).parent / "importable")
 """Where worker processes import from what tests let them do."""
 sys.path.append(IMPORTABLE)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Undo what a command that was run in this process made of the number of threads."""
+    yield
+    set_threads(1)
 
 
 @pytest.fixture

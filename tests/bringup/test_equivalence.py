@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 from rclpy.node import Node
 
 from bringup.command import Choice, Stack
@@ -20,7 +19,6 @@ from mujoban_sokoban.episodes import Episodes
 
 def rolled_out(stack, episodes, time_limit):
     """Return per tick (sequence, direction), torque and reward of the rollout with batch 1."""
-    torch.set_num_threads(1)
     world = World(1, body=stack.body, max_boxes=episodes.max_boxes, time_limit=time_limit)
     return [
         (

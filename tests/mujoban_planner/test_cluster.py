@@ -30,7 +30,6 @@ def play(path, actors):
 
 @pytest.mark.parametrize("make", [search, play])
 def test_actors_on_a_cluster_teach_what_actors_in_this_process_do(make, tmp_path, ray_cluster):
-    torch.set_num_threads(1)
     runs = {}
     for place in ("local", "ray"):
         trainer = make(tmp_path / place, ActorOptions(place, 1, "ordered"))

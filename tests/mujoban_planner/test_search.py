@@ -25,7 +25,6 @@ from mujoban_sokoban.levels import Level, stack_levels, write_levels
 
 @pytest.fixture(scope="module")
 def planner():
-    torch.set_num_threads(1)
     torch.manual_seed(0)
     return ResidualPlanner(8, 1).eval()
 

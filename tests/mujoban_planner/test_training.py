@@ -38,10 +38,7 @@ from mujoban_sokoban.generator import TRAIN_SEEDS, generate_batch
 
 SMALL = {"channels": 8, "blocks": 1, "batch_size": 16}
 
-
-@pytest.fixture(autouse=True)
-def _quick(short_validation):
-    torch.set_num_threads(1)
+pytestmark = pytest.mark.usefixtures("short_validation")
 
 
 def _imitation(path, actors=None, **changes):
